@@ -1,0 +1,109 @@
+//! The decoder (Sec. 3.2): five deconvolutions from the latent up, the encoders' skips fused at each level (Eq. 2).
+
+use burn::module::Module;
+use burn::nn::BatchNorm;
+use burn::nn::conv::{Conv2d, ConvTranspose2d};
+use burn::tensor::{Tensor, activation};
+
+use crate::config::{COLOR_CHANNELS, Head, LEVELS, ModelConfig};
+use crate::init::{GREY_HEAD_SCALE, Init};
+use crate::layers::{conv3x3, deconv4x4, norm, normalised, skip_fusion};
+use crate::weights::{Builder, WeightsError};
+
+/// Five levels from the deepest to the full resolution, and the output convolution.
+#[derive(Module, Debug)]
+pub struct Decoder {
+    /// The levels; index 0 is the deepest, 8C channels at H/16 x W/16.
+    pub levels: Vec<DecoderLevel>,
+    /// 3x3 convolution to colour; a ReLU follows.
+    pub head: Conv2d,
+}
+
+impl Decoder {
+    /// A decoder; a grey head starts at `head_bias`, the training set's mean colour in gamma space.
+    pub(crate) fn build(
+        b: &mut Builder,
+        config: &ModelConfig,
+        head_bias: [f32; 3],
+    ) -> Result<Self, WeightsError> {
+        let channels = config.level_channels();
+        let parts = 1 + config.variant.spec().encoders.len();
+        let levels = b.list("levels", LEVELS, |b, k| {
+            let level = LEVELS - 1 - k;
+            let below = channels[(level + 1).min(LEVELS - 1)];
+            DecoderLevel::build(b, config, [below, channels[level]], parts)
+        })?;
+        let (weight, bias) = match config.head {
+            Head::Grey => (Init::Xavier(GREY_HEAD_SCALE), Init::Color(head_bias)),
+            Head::Xavier => (Init::Xavier(1.0), Init::Zeros),
+        };
+        let head = b.part("head", |b| {
+            conv3x3(b, [channels[0], COLOR_CHANNELS], weight, bias)
+        })?;
+        Ok(Decoder { levels, head })
+    }
+
+    /// Decodes a latent to an image.
+    ///
+    /// `skips` holds one list a level from the deepest up, with one tensor an encoder.
+    ///
+    /// # Shapes
+    /// Latent `[B, 8C, H / 32, W / 32]`, skips of level k `[B, K, H / 2^(4 - k), W / 2^(4 - k)]`, to `[B, 3, H, W]`, not negative.
+    pub fn forward(&self, latent: Tensor<4>, skips: Vec<Vec<Tensor<4>>>) -> Tensor<4> {
+        let image = self
+            .levels
+            .iter()
+            .zip(skips)
+            .fold(latent, |x, (level, skips)| level.forward(x, skips));
+        activation::relu(self.head.forward(image))
+    }
+}
+
+/// One up-sampling unit with its skip fusion.
+#[derive(Module, Debug)]
+pub struct DecoderLevel {
+    /// 4x4 deconvolution, stride 2.
+    pub deconv: ConvTranspose2d,
+    /// The normalisation before the deconvolution's ReLU (released reading).
+    pub norm: Option<BatchNorm>,
+    /// 1x1 convolution of `[decoder | skips]` to the level's channels.
+    pub fuse: Conv2d,
+    /// Whether a ReLU follows the fusion.
+    #[module(skip)]
+    pub activated_fusion: bool,
+}
+
+impl DecoderLevel {
+    fn build(
+        b: &mut Builder,
+        config: &ModelConfig,
+        [below, channels]: [usize; 2],
+        parts: usize,
+    ) -> Result<Self, WeightsError> {
+        let spec = config.reading.spec();
+        Ok(DecoderLevel {
+            deconv: b.part("deconv", |b| deconv4x4(b, [below, channels]))?,
+            norm: spec
+                .normalised_decoder
+                .then(|| b.part("norm", |b| norm(b, channels)))
+                .transpose()?,
+            fuse: b.part("fuse", |b| skip_fusion(b, [parts * channels, channels]))?,
+            activated_fusion: spec.activated_fusion,
+        })
+    }
+
+    /// Up-samples what lies below and fuses the skips into it (Eq. 2).
+    ///
+    /// # Shapes
+    /// `[B, below, H, W]` and skips `[B, K, 2H, 2W]` to `[B, K, 2H, 2W]`.
+    pub fn forward(&self, below: Tensor<4>, skips: Vec<Tensor<4>>) -> Tensor<4> {
+        let decoded = activation::relu(normalised(&self.norm, self.deconv.forward(below)));
+        let parts = std::iter::once(decoded).chain(skips).collect();
+        let fused = self.fuse.forward(Tensor::cat(parts, 1));
+        if self.activated_fusion {
+            activation::relu(fused)
+        } else {
+            fused
+        }
+    }
+}

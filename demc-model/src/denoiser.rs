@@ -1,0 +1,190 @@
+//! The whole network (Fig. 3): fusion, encoders, latent, decoder.
+
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use rand::Rng;
+
+use crate::config::{COLOR_CHANNELS, DOWNSAMPLING, FEATURE_CHANNELS, Input, LEVELS, ModelConfig};
+use crate::decoder::Decoder;
+use crate::encoder::{Encoded, Encoder};
+use crate::fusion::Fusion;
+use crate::layers::ConvBlock;
+use crate::weights::{Builder, Weight, Weights, WeightsError, collect, drawn, taken};
+
+/// A denoising network of any variant and reading.
+///
+/// Field names are the keys of weight files: renaming one changes the file format.
+#[derive(Module, Debug)]
+pub struct Denoiser {
+    /// The feature fusion sub-network, where the variant has one.
+    pub fusion: Option<Fusion>,
+    /// The encoders in the order of the table of variants; the last one feeds the latent.
+    pub encoders: Vec<Encoder>,
+    /// The latent representation's convolution.
+    pub latent: ConvBlock,
+    /// The decoder with the skip fusions and the output head.
+    pub decoder: Decoder,
+    #[module(skip)]
+    config: ModelConfig,
+}
+
+impl ModelConfig {
+    /// A new network with weights drawn from `rng` (Sec. 4.2), the same for the same generator on every device.
+    ///
+    /// `head_bias` is the mean colour of the training set in gamma space, where a [`crate::Head::Grey`] starts.
+    ///
+    /// # Panics
+    /// Where the configuration is invalid; see [`ModelConfig::validate`].
+    pub fn init(&self, rng: &mut impl Rng, head_bias: [f32; 3], device: &Device) -> Denoiser {
+        let mut source = drawn(rng);
+        let mut builder = Builder::new(&mut source, device);
+        Denoiser::build(&mut builder, self, head_bias)
+            .expect("a drawn weight has the shape it was asked for")
+    }
+
+    /// The network that these weights make.
+    ///
+    /// # Errors
+    /// A weight that is missing, has another shape or does not belong to the network, by name.
+    pub fn load(&self, weights: &mut Weights, device: &Device) -> Result<Denoiser, WeightsError> {
+        let denoiser = {
+            let mut source = taken(weights);
+            Denoiser::build(&mut Builder::new(&mut source, device), self, [0.0; 3])?
+        };
+        weights.all_taken()?;
+        Ok(denoiser)
+    }
+}
+
+impl Denoiser {
+    fn build(
+        b: &mut Builder,
+        config: &ModelConfig,
+        head_bias: [f32; 3],
+    ) -> Result<Self, WeightsError> {
+        let spec = config.variant.spec();
+        let deepest = config.level_channels()[LEVELS - 1];
+        let fusion = match spec.has_fusion() {
+            true => Some(b.part("fusion", |b| Fusion::build(b, config.width))?),
+            false => None,
+        };
+        let encoders = b.list("encoders", spec.encoders.len(), |b, e| {
+            let input = spec.encoders[e].iter().map(|input| input.channels()).sum();
+            Encoder::build(b, config, input, e + 1 == spec.encoders.len())
+        })?;
+        let normalised = config.reading.spec().normalised_decoder;
+        let latent = b.part("latent", |b| {
+            ConvBlock::build(b, [deepest, deepest], normalised)
+        })?;
+        let decoder = b.part("decoder", |b| Decoder::build(b, config, head_bias))?;
+        Ok(Denoiser {
+            fusion,
+            encoders,
+            latent,
+            decoder,
+            config: *config,
+        })
+    }
+
+    /// What this network is.
+    pub fn config(&self) -> &ModelConfig {
+        &self.config
+    }
+
+    /// Denoises gamma-compressed colour with the help of Z-scored features.
+    ///
+    /// Batch normalisation uses the batch's statistics on a device with autodiff, the running ones elsewhere.
+    ///
+    /// # Shapes
+    /// `color_gamma` `[B, 3, H, W]`, `features_z` `[B, 12, H, W]`, H and W multiples of 32; returns `[B, 3, H, W]` in gamma
+    /// space, not negative.
+    ///
+    /// # Panics
+    /// Where the shapes are others.
+    pub fn forward(&self, color_gamma: Tensor<4>, features_z: Tensor<4>) -> Tensor<4> {
+        assert_shapes(color_gamma.dims(), features_z.dims());
+        let detail_map = self.detail_map(features_z.clone());
+        let image = |input: &Input| match input {
+            Input::Color => color_gamma.clone(),
+            Input::Features => features_z.clone(),
+            Input::DetailMap => detail_map
+                .clone()
+                .expect("a variant whose encoder eats the detail map has a fusion"),
+        };
+        let inputs = self.config.variant.spec().encoders;
+        let mut encoded: Vec<Encoded> = self
+            .encoders
+            .iter()
+            .zip(inputs)
+            .map(|(encoder, inputs)| {
+                encoder.forward(Tensor::cat(inputs.iter().map(image).collect(), 1))
+            })
+            .collect();
+        let bottom = encoded
+            .last_mut()
+            .and_then(|last| last.bottom.take())
+            .expect("the last encoder feeds the latent");
+        self.decoder
+            .forward(self.latent.forward(bottom), skips_by_level(encoded))
+    }
+
+    /// The detail map (Fig. 2 e) of Z-scored features; `None` for a variant without fusion.
+    ///
+    /// # Shapes
+    /// `[B, 12, H, W]` to `[B, 3, H, W]`, not negative.
+    pub fn detail_map(&self, features_z: Tensor<4>) -> Option<Tensor<4>> {
+        self.fusion
+            .as_ref()
+            .map(|fusion| fusion.forward(features_z))
+    }
+
+    /// All weights on the host, in the order of the fields, the running statistics of batch normalisation among them.
+    pub fn weights(&self) -> Vec<Weight> {
+        // `valid` also brings the running statistics up to date: Burn merges an update only at the next one.
+        collect(&self.valid())
+    }
+
+    /// Number of trainable values: all weights but the running statistics.
+    pub fn parameter_count(&self) -> usize {
+        let weights = self.weights();
+        weights
+            .iter()
+            .filter(|weight| weight.is_trainable())
+            .map(|weight| weight.data.len())
+            .sum()
+    }
+}
+
+impl Weight {
+    /// Whether the optimizer changes it: false for the running statistics of batch normalisation.
+    pub fn is_trainable(&self) -> bool {
+        !self.name.contains("norm.running_")
+    }
+}
+
+/// The encoders' skips regrouped for the decoder: a list a level, deepest first, of one tensor an encoder.
+fn skips_by_level(encoded: Vec<Encoded>) -> Vec<Vec<Tensor<4>>> {
+    let mut encoders: Vec<_> = encoded
+        .into_iter()
+        .map(|e| e.skips.into_iter().rev())
+        .collect();
+    (0..LEVELS)
+        .map(|_| encoders.iter_mut().filter_map(Iterator::next).collect())
+        .collect()
+}
+
+fn assert_shapes([batch, colors, height, width]: [usize; 4], features: [usize; 4]) {
+    assert_eq!(
+        colors, COLOR_CHANNELS,
+        "color_gamma has {COLOR_CHANNELS} channels"
+    );
+    assert_eq!(
+        features,
+        [batch, FEATURE_CHANNELS, height, width],
+        "features_z fits color_gamma"
+    );
+    assert!(
+        height > 0 && width > 0 && height % DOWNSAMPLING == 0 && width % DOWNSAMPLING == 0,
+        "{height} x {width}: height and width are multiples of {DOWNSAMPLING}"
+    );
+}

@@ -1,0 +1,42 @@
+//! The feature fusion sub-network (Sec. 3.2): twelve feature channels to a three-channel detail map (Fig. 2 e).
+
+use burn::module::Module;
+use burn::tensor::Tensor;
+
+use crate::config::{DETAIL_CHANNELS, FEATURE_CHANNELS};
+use crate::layers::ConvBlock;
+use crate::weights::{Builder, WeightsError};
+
+/// Four convolutional blocks; the two in the middle are batch normalised.
+#[derive(Module, Debug)]
+pub struct Fusion {
+    /// The blocks, first to last.
+    pub blocks: Vec<ConvBlock>,
+}
+
+impl Fusion {
+    pub(crate) fn build(b: &mut Builder, width: usize) -> Result<Self, WeightsError> {
+        let blocks = [
+            ([FEATURE_CHANNELS, width], false),
+            ([width, width], true),
+            ([width, width], true),
+            ([width, DETAIL_CHANNELS], false),
+        ];
+        Ok(Fusion {
+            blocks: b.list("blocks", blocks.len(), |b, i| {
+                let (channels, normalised) = blocks[i];
+                ConvBlock::build(b, channels, normalised)
+            })?,
+        })
+    }
+
+    /// Fuses Z-scored features to the detail map.
+    ///
+    /// # Shapes
+    /// `[B, 12, H, W]` to `[B, 3, H, W]`.
+    pub fn forward(&self, features_z: Tensor<4>) -> Tensor<4> {
+        self.blocks
+            .iter()
+            .fold(features_z, |x, block| block.forward(x))
+    }
+}

@@ -1,0 +1,138 @@
+//! Initial weights as pure functions (Sec. 4.2): Xavier, the bilinear deconvolution, the identity skip fusion.
+//!
+//! Weights are drawn on the host from the caller's generator in the fixed order of the modules, never by the device:
+//! the same seed gives the same network everywhere.
+
+use rand::{Rng, RngExt};
+
+/// Factor on the Xavier weights of a grey head; ours (network.md: with bias 0.3 and 0.1 no output starts below zero).
+pub const GREY_HEAD_SCALE: f32 = 0.1;
+
+/// How one tensor starts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Init {
+    /// Zero: every bias, the shift of a batch normalisation, its running mean.
+    Zeros,
+    /// One: the scale of a batch normalisation, its running variance.
+    Ones,
+    /// Xavier uniform (Glorot and Bengio 2010) times a factor: convolutions.
+    Xavier(f32),
+    /// The bilinear up-sampling kernel on `w[j, j]`: deconvolutions.
+    Bilinear,
+    /// `[I I I]` (Eq. 3): the skip fusion starts as the sum of its inputs.
+    IdentitySum,
+    /// Three given values: the bias of a grey head.
+    Color([f32; 3]),
+}
+
+impl Init {
+    /// The values of a tensor of this shape, row-major.
+    ///
+    /// # Shapes
+    /// `[out, in, h, w]` for `Xavier` and `IdentitySum`, `[in, out, 4, 4]` for `Bilinear`, `[3]` for `Color`.
+    ///
+    /// # Panics
+    /// Where the shape does not fit: a bug of the module that asks.
+    pub fn draw(self, shape: &[usize], rng: &mut impl Rng) -> Vec<f32> {
+        let len = shape.iter().product();
+        match self {
+            Init::Zeros => vec![0.0; len],
+            Init::Ones => vec![1.0; len],
+            Init::Xavier(scale) => xavier(shape, scale, rng),
+            Init::Bilinear => bilinear(shape),
+            Init::IdentitySum => identity_sum(shape),
+            Init::Color(values) => {
+                assert_eq!(shape, [3], "a colour has three channels");
+                values.to_vec()
+            }
+        }
+    }
+}
+
+/// Uniform in +-sqrt(6 / (fan_in + fan_out)), times `scale`.
+fn xavier(shape: &[usize], scale: f32, rng: &mut impl Rng) -> Vec<f32> {
+    let [out, input, height, width] = four(shape);
+    let fan_sum = (input + out) * height * width;
+    let bound = (6.0 / fan_sum as f32).sqrt();
+    (0..shape.iter().product())
+        .map(|_| scale * bound * (2.0 * rng.random::<f32>() - 1.0))
+        .collect()
+}
+
+/// The outer product of [.25 .75 .75 .25] on the diagonal, zero elsewhere (as in hdrcnn, from which the scheme comes).
+fn bilinear(shape: &[usize]) -> Vec<f32> {
+    const TAPS: [f32; 4] = [0.25, 0.75, 0.75, 0.25];
+    let [input, out, height, width] = four(shape);
+    assert_eq!([height, width], [4, 4], "a bilinear deconvolution is 4x4");
+    let mut weight = vec![0.0; input * out * 16];
+    for j in 0..input.min(out) {
+        let kernel = &mut weight[(j * out + j) * 16..][..16];
+        for (k, value) in kernel.iter_mut().enumerate() {
+            *value = TAPS[k / 4] * TAPS[k % 4];
+        }
+    }
+    weight
+}
+
+/// `[I I ... I]`: `in / out` identity blocks side by side (Eq. 3).
+fn identity_sum(shape: &[usize]) -> Vec<f32> {
+    let [out, input, height, width] = four(shape);
+    assert_eq!([height, width], [1, 1], "a skip fusion is 1x1");
+    assert_eq!(
+        input % out,
+        0,
+        "a skip fusion takes whole multiples of its width"
+    );
+    let mut weight = vec![0.0; out * input];
+    for row in 0..out {
+        for block in 0..input / out {
+            weight[row * input + block * out + row] = 1.0;
+        }
+    }
+    weight
+}
+
+fn four(shape: &[usize]) -> [usize; 4] {
+    shape
+        .try_into()
+        .expect("convolution weights have four axes")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    #[test]
+    fn xavier_fills_its_range_and_no_more() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let weights = Init::Xavier(1.0).draw(&[32, 16, 3, 3], &mut rng);
+        let bound = (6.0f32 / (48.0 * 9.0)).sqrt();
+        let largest = weights.iter().fold(0.0f32, |m, w| m.max(w.abs()));
+        assert!(largest <= bound && largest > 0.99 * bound);
+        let mean: f32 = weights.iter().sum::<f32>() / weights.len() as f32;
+        // The mean of 4608 uniform values has a deviation of bound / sqrt(3 * 4608) = 0.0085 bounds; 5 of them.
+        assert!(mean.abs() < 0.043 * bound, "mean {mean}");
+    }
+
+    #[test]
+    fn bilinear_kernel_sums_to_four_and_stays_on_the_diagonal() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let weights = Init::Bilinear.draw(&[3, 2, 4, 4], &mut rng);
+        for (block, kernel) in weights.chunks(16).enumerate() {
+            let (input, out) = (block / 2, block % 2);
+            let expected = if input == out { 4.0 } else { 0.0 };
+            assert_eq!(kernel.iter().sum::<f32>(), expected);
+        }
+        assert_eq!(weights[0], 0.0625);
+        assert_eq!(weights[5], 0.5625);
+    }
+
+    #[test]
+    fn identity_sum_is_a_row_of_identities() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let weights = Init::IdentitySum.draw(&[2, 6, 1, 1], &mut rng);
+        assert_eq!(weights, [1., 0., 1., 0., 1., 0., 0., 1., 0., 1., 0., 1.]);
+    }
+}

@@ -1,0 +1,125 @@
+//! The four kinds of layer that the network is made of, with the paper's settings, around Burn's own modules.
+//!
+//! Burn's defaults differ from the paper's network (a random bias under Xavier, batch normalisation with epsilon 1e-5
+//! and momentum 0.1), so everything is written out here, once.
+
+use burn::module::{Module, Param};
+use burn::nn::conv::{Conv2d, ConvTranspose2d};
+use burn::nn::{BatchNorm, PaddingConfig2d};
+use burn::tensor::{Tensor, activation};
+
+use crate::init::Init;
+use crate::weights::{Builder, WeightsError};
+
+/// Epsilon of every batch normalisation (the authors' TensorFlow 1.13 default; network.md).
+pub const NORM_EPSILON: f64 = 1e-3;
+
+/// Share of a batch's statistics in the running ones (TensorFlow's momentum of 0.99).
+pub const NORM_MOMENTUM: f64 = 0.01;
+
+/// A 3x3 convolution with padding 1, with or without batch normalisation, and a ReLU: the block of Sec. 3.2.
+#[derive(Module, Debug)]
+pub struct ConvBlock {
+    /// The convolution, with bias.
+    pub conv: Conv2d,
+    /// The normalisation between convolution and ReLU.
+    pub norm: Option<BatchNorm>,
+}
+
+impl ConvBlock {
+    /// A block from `input` to `output` channels.
+    pub(crate) fn build(
+        b: &mut Builder,
+        channels: [usize; 2],
+        normalised: bool,
+    ) -> Result<Self, WeightsError> {
+        Ok(ConvBlock {
+            conv: b.part("conv", |b| {
+                conv3x3(b, channels, Init::Xavier(1.0), Init::Zeros)
+            })?,
+            norm: normalised
+                .then(|| b.part("norm", |b| norm(b, channels[1])))
+                .transpose()?,
+        })
+    }
+
+    /// Convolves, normalises, rectifies.
+    ///
+    /// # Shapes
+    /// `[B, in, H, W]` to `[B, out, H, W]`.
+    pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+        activation::relu(normalised(&self.norm, self.conv.forward(x)))
+    }
+}
+
+/// `x` through the normalisation, if there is one.
+pub(crate) fn normalised(norm: &Option<BatchNorm>, x: Tensor<4>) -> Tensor<4> {
+    match norm {
+        Some(norm) => norm.forward(x),
+        None => x,
+    }
+}
+
+/// A 3x3 convolution that keeps height and width.
+pub(crate) fn conv3x3(
+    b: &mut Builder,
+    channels: [usize; 2],
+    weight: Init,
+    bias: Init,
+) -> Result<Conv2d, WeightsError> {
+    conv(b, channels, 3, weight, bias)
+}
+
+/// The 1x1 convolution of a skip fusion (Eq. 2), started as the sum of its inputs (Eq. 3).
+pub(crate) fn skip_fusion(b: &mut Builder, channels: [usize; 2]) -> Result<Conv2d, WeightsError> {
+    conv(b, channels, 1, Init::IdentitySum, Init::Zeros)
+}
+
+fn conv(
+    b: &mut Builder,
+    [input, output]: [usize; 2],
+    kernel: usize,
+    weight: Init,
+    bias: Init,
+) -> Result<Conv2d, WeightsError> {
+    Ok(Conv2d {
+        weight: b.parameter("weight", [output, input, kernel, kernel], weight)?,
+        bias: Some(b.parameter("bias", [output], bias)?),
+        stride: [1, 1],
+        kernel_size: [kernel, kernel],
+        dilation: [1, 1],
+        groups: 1,
+        padding: PaddingConfig2d::Explicit(kernel / 2, kernel / 2, kernel / 2, kernel / 2),
+    })
+}
+
+/// The 4x4 deconvolution with stride 2 and padding 1: exactly twice the size (Sec. 3.2), started bilinear (Sec. 4.2).
+pub(crate) fn deconv4x4(
+    b: &mut Builder,
+    [input, output]: [usize; 2],
+) -> Result<ConvTranspose2d, WeightsError> {
+    Ok(ConvTranspose2d {
+        weight: b.parameter("weight", [input, output, 4, 4], Init::Bilinear)?,
+        bias: Some(b.parameter("bias", [output], Init::Zeros)?),
+        stride: [2, 2],
+        kernel_size: [4, 4],
+        dilation: [1, 1],
+        groups: 1,
+        padding: [1, 1],
+        padding_out: [0, 0],
+        channels: [input, output],
+    })
+}
+
+/// A batch normalisation that starts as the identity.
+pub(crate) fn norm(b: &mut Builder, channels: usize) -> Result<BatchNorm, WeightsError> {
+    Ok(BatchNorm {
+        gamma: b.parameter("gamma", [channels], Init::Ones)?,
+        beta: b.parameter("beta", [channels], Init::Zeros)?,
+        training: Param::from_bool(true),
+        running_mean: b.running_state("running_mean", channels, Init::Zeros)?,
+        running_var: b.running_state("running_var", channels, Init::Ones)?,
+        momentum: NORM_MOMENTUM,
+        epsilon: NORM_EPSILON,
+    })
+}
