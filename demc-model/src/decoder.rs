@@ -20,7 +20,7 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// A decoder; a grey head starts at `head_bias`, the training set's mean colour in gamma space.
+    /// A decoder; a grey head starts at `head_bias`, a flat image in gamma space.
     pub(crate) fn build(
         b: &mut Builder,
         config: &ModelConfig,

@@ -31,7 +31,8 @@ pub struct Denoiser {
 impl ModelConfig {
     /// A new network with weights drawn from `rng` (Sec. 4.2), the same for the same generator on every device.
     ///
-    /// `head_bias` is the mean colour of the training set in gamma space, where a [`crate::Head::Grey`] starts.
+    /// `head_bias` is the flat image where a [`crate::Head::Grey`] starts, in gamma space: best the one with the least
+    /// loss on the training set.
     ///
     /// # Panics
     /// Where the configuration is invalid; see [`ModelConfig::validate`].

@@ -5,7 +5,7 @@
 
 use rand::{Rng, RngExt};
 
-/// Factor on the Xavier weights of a grey head; ours (network.md: with bias 0.3 and 0.1 no output starts below zero).
+/// Factor on the Xavier weights of a grey head; ours: with 0.1 no output starts below zero.
 pub const GREY_HEAD_SCALE: f32 = 0.1;
 
 /// How one tensor starts.

@@ -35,7 +35,7 @@ fn pattern(shape: [usize; 4], phase: f32, device: &Device) -> Tensor<4> {
 }
 
 fn values(tensor: Tensor<4>) -> Vec<f32> {
-    tensor.into_data().try_to_vec().unwrap()
+    tensor.into_data().try_to_vec().expect("float32")
 }
 
 /// Trainable totals (network.md, counted from the paper's text and from the authors' model).

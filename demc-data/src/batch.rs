@@ -1,0 +1,197 @@
+//! Batches of training patches. The patch stream is epoch 0, epoch 1, ... end to end, each epoch a seeded
+//! permutation of all patches; batch n is patches `n B .. (n + 1) B` of it. So a batch depends on the
+//! configuration, the seed and n only, and a resumed run goes on where it stopped.
+
+use crate::augment::{Augment, Orientation};
+use crate::cache::{CacheUse, SceneCache};
+use crate::frame::{FEATURES, FramePlanes};
+use crate::patch::{Patch, epoch_order, patches};
+use crate::plane::Plane;
+use crate::{ChannelLayout, DataConfig, Error, Normalizer, Scene};
+
+/// Patches in the network's input space, with their references. B patches of P x P pixels.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Batch {
+    /// B.
+    pub size: usize,
+    /// Noisy colour `[B, 3, P, P]`, gamma space.
+    pub color_gamma: Vec<f32>,
+    /// Features `[B, 12, P, P]`, Z-scored.
+    pub features_z: Vec<f32>,
+    /// Reference colour `[B, 3, P, P]`, linear HDR.
+    pub reference_hdr: Vec<f32>,
+    /// Where each patch was cut, before any flip or transpose.
+    pub patches: Vec<Patch>,
+}
+
+/// Makes any batch of a training run, from any thread.
+pub struct PatchSource {
+    cache: SceneCache,
+    patches: Vec<Patch>,
+    normalizer: Normalizer,
+    patch_size: usize,
+    batch_size: usize,
+    augment: Augment,
+    workers: usize,
+    seed: u64,
+}
+
+/// One place in the patch stream.
+struct Draw {
+    patch: Patch,
+    orientation: Orientation,
+}
+
+/// One patch's share of a batch's buffers.
+struct Place<'a> {
+    draw: Draw,
+    color: &'a mut [f32],
+    features: &'a mut [f32],
+    reference: &'a mut [f32],
+}
+
+impl PatchSource {
+    /// A source over the training `scenes`, which have a reference each. `normalizer` holds their statistics;
+    /// `config` must be valid.
+    ///
+    /// # Errors
+    /// [`Error::SceneTooSmall`]; [`Error::Layout`] if `layout` names no reference.
+    ///
+    /// # Panics
+    /// If there are no scenes: [`crate::Dataset::split`] never returns none.
+    pub fn new(
+        config: &DataConfig,
+        scenes: Vec<Scene>,
+        layout: ChannelLayout,
+        normalizer: Normalizer,
+        seed: u64,
+    ) -> Result<Self, Error> {
+        if layout.reference.is_none() {
+            let detail = "names no reference, which training needs".to_owned();
+            return Err(Error::Layout {
+                name: config.layout.clone(),
+                detail,
+            });
+        }
+        assert!(!scenes.is_empty(), "training needs at least one scene");
+        let patches = patches(&scenes, config.patch_size, config.stride, config.border)?;
+        Ok(Self {
+            cache: SceneCache::new(scenes, layout, config.cache_mib << 20),
+            patches,
+            normalizer,
+            patch_size: config.patch_size,
+            batch_size: config.batch_size,
+            augment: config.augment,
+            workers: config.workers,
+            seed,
+        })
+    }
+
+    /// The patches of one epoch, in grid order.
+    pub fn patches(&self) -> &[Patch] {
+        &self.patches
+    }
+
+    /// The scenes that [`Patch::scene`] counts.
+    pub fn scenes(&self) -> &[Scene] {
+        self.cache.scenes()
+    }
+
+    /// How many threads a loader should run.
+    pub fn workers(&self) -> usize {
+        self.workers
+    }
+
+    /// What the scene cache holds.
+    pub fn cache_usage(&self) -> CacheUse {
+        self.cache.usage()
+    }
+
+    /// Batch `n` of the run.
+    ///
+    /// # Errors
+    /// As [`SceneCache::get`], for a scene that it needs.
+    pub fn batch(&self, n: u64) -> Result<Batch, Error> {
+        let draws = self.draws(n);
+        let pixels = self.patch_size * self.patch_size;
+        let mut batch = Batch {
+            size: draws.len(),
+            color_gamma: vec![0.0; draws.len() * 3 * pixels],
+            features_z: vec![0.0; draws.len() * FEATURES * pixels],
+            reference_hdr: vec![0.0; draws.len() * 3 * pixels],
+            patches: draws.iter().map(|draw| draw.patch).collect(),
+        };
+        let color = batch.color_gamma.chunks_exact_mut(3 * pixels);
+        let features = batch.features_z.chunks_exact_mut(FEATURES * pixels);
+        let reference = batch.reference_hdr.chunks_exact_mut(3 * pixels);
+        let mut places: Vec<Place> = draws
+            .into_iter()
+            .zip(color.zip(features.zip(reference)))
+            .map(|(draw, (color, (features, reference)))| Place {
+                draw,
+                color,
+                features,
+                reference,
+            })
+            .collect();
+        // Scene by scene: with a cache smaller than the data, each scene is decoded once a batch.
+        places.sort_by_key(|place| place.draw.patch.scene);
+        for places in places.chunk_by_mut(|a, b| a.draw.patch.scene == b.draw.patch.scene) {
+            let planes = self.cache.get(places[0].draw.patch.scene as usize)?;
+            for place in places {
+                self.cut(&planes, place);
+            }
+        }
+        Ok(batch)
+    }
+
+    /// Where batch `n` is cut, in the order of the stream.
+    fn draws(&self, n: u64) -> Vec<Draw> {
+        let count = self.patches.len() as u64;
+        let mut epoch = n * self.batch_size as u64 / count;
+        let mut position = n * self.batch_size as u64 % count;
+        let mut draws = Vec::with_capacity(self.batch_size);
+        while draws.len() < self.batch_size {
+            let order = epoch_order(self.patches.len(), self.seed, epoch);
+            for &index in order
+                .iter()
+                .skip(position as usize)
+                .take(self.batch_size - draws.len())
+            {
+                let orientation = self.augment.draw(self.seed, epoch, position);
+                draws.push(Draw {
+                    patch: self.patches[index as usize],
+                    orientation,
+                });
+                position += 1;
+            }
+            (epoch, position) = (epoch + 1, 0);
+        }
+        draws
+    }
+
+    /// Cuts one patch, turns it and takes it to the network's space.
+    fn cut(&self, from: &FramePlanes, place: &mut Place<'_>) {
+        let reference = from.reference.as_ref().expect("it is read as required");
+        for (planes, out) in [
+            (&from.color, &mut place.color),
+            (&from.features, &mut place.features),
+            (reference, &mut place.reference),
+        ] {
+            cut_planes(planes, from.width, place.draw.patch, self.patch_size, out);
+            place.draw.orientation.apply(out, self.patch_size);
+        }
+        self.normalizer.color_gamma_from_hdr(place.color);
+        self.normalizer.features_z_from_raw(place.features);
+    }
+}
+
+/// Copies a patch of every plane to `out`, `[planes, size, size]`.
+fn cut_planes(planes: &[Plane], width: usize, patch: Patch, size: usize, out: &mut [f32]) {
+    let origin = patch.y as usize * width + patch.x as usize;
+    for (plane, out) in planes.iter().zip(out.chunks_exact_mut(size * size)) {
+        for (row, out) in out.chunks_exact_mut(size).enumerate() {
+            plane.copy_to(origin + row * width, out);
+        }
+    }
+}

@@ -1,0 +1,130 @@
+//! `demc-data inspect`.
+
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+use demc_data::channel::{Channel, Kind};
+use demc_data::exr::ExrFile;
+use demc_data::plane::Plane;
+use serde::Serialize;
+
+/// What one channel holds.
+#[derive(Serialize)]
+struct Row {
+    name: String,
+    layer: Option<String>,
+    #[serde(rename = "type")]
+    kind: Kind,
+    size: String,
+    /// Of the finite samples; none if there are none.
+    range: Option<Range>,
+    non_finite: usize,
+}
+
+#[derive(Serialize)]
+struct Range {
+    min: f32,
+    max: f32,
+    mean: f64,
+}
+
+/// One file.
+#[derive(Serialize)]
+struct Report<'a> {
+    file: &'a Path,
+    channels: Vec<Row>,
+}
+
+/// Prints a table for each file, or one JSON array of all.
+pub fn run(files: &[PathBuf], json: bool) -> Result<()> {
+    let mut reports = Vec::new();
+    for file in files {
+        let report = Report {
+            file,
+            channels: rows(file)?,
+        };
+        if json {
+            reports.push(report);
+        } else {
+            super::print(&table(&report))?;
+        }
+    }
+    if json {
+        super::print(&(serde_json::to_string_pretty(&reports)? + "\n"))?;
+    }
+    Ok(())
+}
+
+fn rows(path: &Path) -> Result<Vec<Row>> {
+    let file = ExrFile::open(path)?;
+    let channels = file.channels().to_vec();
+    let names: Vec<&str> = channels
+        .iter()
+        .map(|channel| channel.name.as_str())
+        .collect();
+    let planes = file.read(&names)?;
+    Ok(channels
+        .iter()
+        .zip(&planes)
+        .map(|(channel, plane)| row(channel, plane))
+        .collect())
+}
+
+fn row(channel: &Channel, plane: &Plane) -> Row {
+    let samples = plane.to_f32();
+    let finite = samples.iter().copied().filter(|sample| sample.is_finite());
+    let count = finite.clone().count();
+    let range = (count > 0).then(|| Range {
+        min: finite.clone().fold(f32::INFINITY, f32::min),
+        max: finite.clone().fold(f32::NEG_INFINITY, f32::max),
+        mean: finite.map(f64::from).sum::<f64>() / count as f64,
+    });
+    Row {
+        name: channel.name.clone(),
+        layer: channel.layer.clone(),
+        kind: channel.kind,
+        size: channel.window.to_string(),
+        range,
+        non_finite: samples.len() - count,
+    }
+}
+
+fn table(report: &Report<'_>) -> String {
+    let rows = &report.channels;
+    let longest = |text: fn(&Row) -> &str, title: &str| {
+        rows.iter()
+            .map(|row| text(row).chars().count())
+            .chain([title.len()])
+            .max()
+            .unwrap_or(0)
+    };
+    let name_width = longest(|row| &row.name, "channel");
+    let size_width = longest(|row| &row.size, "size");
+    let mut text = format!("{}: {} channels", report.file.display(), rows.len());
+    let mut layers: Vec<&str> = rows.iter().filter_map(|row| row.layer.as_deref()).collect();
+    layers.dedup();
+    if !layers.is_empty() {
+        // Writing to a String cannot fail.
+        let _ = write!(text, ", layers {}", layers.join(", "));
+    }
+    let _ = writeln!(
+        text,
+        "\n  {:name_width$}  {:5}  {:size_width$}  {:>11}  {:>11}  {:>11}  {:>7}",
+        "channel", "type", "size", "min", "max", "mean", "NaN/inf"
+    );
+    for row in rows {
+        let [min, max, mean] = match &row.range {
+            Some(range) => {
+                [f64::from(range.min), f64::from(range.max), range.mean].map(super::number)
+            }
+            None => ["-"; 3].map(str::to_owned),
+        };
+        let _ = writeln!(
+            text,
+            "  {:name_width$}  {:5}  {:size_width$}  {min:>11}  {max:>11}  {mean:>11}  {:>7}",
+            row.name, row.kind, row.size, row.non_finite
+        );
+    }
+    text
+}

@@ -1,0 +1,107 @@
+//! The command line: arguments, and what is done with them.
+
+mod inspect;
+mod stats;
+
+use std::io::{ErrorKind, Write};
+use std::path::PathBuf;
+
+use anyhow::{Context, Result};
+use clap::{Args, Parser, Subcommand};
+use demc_data::Split;
+
+/// Looks into the images and data sets that a DEMC denoiser is trained on.
+///
+/// Exit status: 0 done, 1 a file or data set cannot be used, 2 wrong arguments.
+#[derive(Parser)]
+#[command(version, max_term_width = 100)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Show what is in OpenEXR files: size, channels, and each channel's type and range.
+    ///
+    /// Channel names are printed as a channel layout has to spell them: `Layer.channel` in a file of
+    /// several parts. Minimum, maximum and mean leave out NaN and infinite samples, which the last column
+    /// counts: training and denoising refuse a file that has any.
+    Inspect(Inspect),
+    /// Measure a data set: scenes, sizes, patches, and each feature's mean and standard deviation.
+    ///
+    /// The numbers are those that training subtracts and divides by: over every pixel of the split, but
+    /// without the misses (`mask.A` = 0) for normal and position. Every file's header is checked, and the
+    /// split's files are read whole.
+    Stats(Stats),
+}
+
+/// Arguments of `inspect`.
+#[derive(Args)]
+#[command(after_help = "Example:\n  demc-data inspect data/sample/train/*.exr")]
+struct Inspect {
+    /// OpenEXR files: half, float or uint channels, one part or several, scan lines or tiles
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// Print one JSON array instead of tables
+    #[arg(long)]
+    json: bool,
+}
+
+/// Arguments of `stats`.
+#[derive(Args)]
+#[command(
+    after_help = "Examples:\n  demc-data stats data/sample\n  demc-data stats renders --layout my-renderer.toml --json"
+)]
+struct Stats {
+    /// Directory of the data set, with its manifest.json
+    #[arg(value_name = "DIR")]
+    root: PathBuf,
+    /// Channel layout: demc-exr, mitsuba3, pbrt-v4, cycles, fbksd, or a TOML file
+    #[arg(long, default_value = "demc-exr")]
+    layout: String,
+    /// The split to measure
+    #[arg(long, default_value = "train", value_parser = parse_split, value_name = "train|test")]
+    split: Split,
+    /// Print one JSON object instead of a table
+    #[arg(long)]
+    json: bool,
+}
+
+impl Cli {
+    /// Does what was asked for.
+    ///
+    /// # Errors
+    /// The first file or data set that cannot be used; what came before it was printed.
+    pub fn run(self) -> Result<()> {
+        match self.command {
+            Command::Inspect(args) => inspect::run(&args.files, args.json),
+            Command::Stats(args) => stats::run(&args.root, &args.layout, args.split, args.json),
+        }
+    }
+}
+
+fn parse_split(text: &str) -> Result<Split, String> {
+    match text {
+        "train" => Ok(Split::Train),
+        "test" => Ok(Split::Test),
+        _ => Err("expected train or test".to_owned()),
+    }
+}
+
+/// Prints to standard output; whoever reads it may stop reading early.
+fn print(text: &str) -> Result<()> {
+    match std::io::stdout().write_all(text.as_bytes()) {
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
+        result => result.context("cannot write to standard output"),
+    }
+}
+
+/// Six significant digits or so, in at most eleven characters.
+fn number(value: f64) -> String {
+    match value.abs() {
+        0.0 => "0".to_owned(),
+        1e-4..1e6 => format!("{value:.5}"),
+        _ => format!("{value:.4e}"),
+    }
+}

@@ -1,0 +1,153 @@
+//! `demc-data stats`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write;
+use std::path::Path;
+
+use anyhow::Result;
+use demc_data::frame::FEATURE_NAMES;
+use demc_data::patch::patches;
+use demc_data::{ChannelLayout, DataConfig, Dataset, Scene, Split, Statistics};
+use serde::Serialize;
+
+/// What is known of a data set.
+#[derive(Serialize)]
+struct Report<'a> {
+    root: &'a Path,
+    layout: &'a str,
+    /// All splits that have scenes.
+    splits: BTreeMap<Split, Contents>,
+    /// The split that the rest was measured on.
+    split: Split,
+    pixels: u64,
+    /// Share of the pixels that hit nothing.
+    misses: f64,
+    /// Negative samples of colour and reference, which are set to 0.
+    negative: u64,
+    /// Mean and standard deviation of each feature.
+    features: Vec<Feature>,
+    /// Mean reference colour in gamma space.
+    flat_color: [f32; 3],
+}
+
+#[derive(Serialize)]
+struct Contents {
+    scenes: usize,
+    base_scenes: BTreeSet<String>,
+    /// How many scenes have each size.
+    sizes: BTreeMap<String, usize>,
+    /// Patches of the default size, stride and border; none if a scene is too small to hold one.
+    patches: Option<usize>,
+}
+
+#[derive(Serialize)]
+struct Feature {
+    name: &'static str,
+    mean: f32,
+    std: f32,
+}
+
+/// Measures the data set at `root` and prints a table or a JSON object.
+pub fn run(root: &Path, layout_name: &str, split: Split, json: bool) -> Result<()> {
+    let layout = ChannelLayout::resolve(layout_name)?;
+    let dataset = Dataset::open(root, &layout)?;
+    let config = DataConfig::default();
+    let measured = Statistics::measure(&dataset.split(split)?, &layout, config.gamma)?;
+    let splits = [Split::Train, Split::Test].into_iter().filter_map(|split| {
+        let scenes = dataset.split(split).ok()?;
+        Some((split, contents(&scenes, &config)))
+    });
+    let normalizer = measured.normalizer;
+    let stats = normalizer
+        .features
+        .mean
+        .into_iter()
+        .zip(normalizer.features.std);
+    let report = Report {
+        root,
+        layout: layout_name,
+        splits: splits.collect(),
+        split,
+        pixels: measured.pixels,
+        misses: measured.misses as f64 / measured.pixels as f64,
+        negative: measured.clamped,
+        features: FEATURE_NAMES
+            .into_iter()
+            .zip(stats)
+            .map(|(name, (mean, std))| Feature { name, mean, std })
+            .collect(),
+        flat_color: normalizer.flat_color,
+    };
+    if json {
+        super::print(&(serde_json::to_string_pretty(&report)? + "\n"))
+    } else {
+        super::print(&table(&report, &config))
+    }
+}
+
+fn contents(scenes: &[Scene], config: &DataConfig) -> Contents {
+    let mut sizes = BTreeMap::new();
+    for scene in scenes {
+        *sizes
+            .entry(format!("{}x{}", scene.width, scene.height))
+            .or_default() += 1;
+    }
+    Contents {
+        scenes: scenes.len(),
+        base_scenes: scenes.iter().map(|scene| scene.base.clone()).collect(),
+        sizes,
+        patches: patches(scenes, config.patch_size, config.stride, config.border)
+            .ok()
+            .map(|patches| patches.len()),
+    }
+}
+
+fn table(report: &Report<'_>, config: &DataConfig) -> String {
+    let mut text = format!("{} (layout {})\n", report.root.display(), report.layout);
+    // Writing to a String cannot fail.
+    for (split, contents) in &report.splits {
+        let sizes: Vec<String> = contents
+            .sizes
+            .iter()
+            .map(|(size, scenes)| format!("{scenes} of {size}"))
+            .collect();
+        let patches = match contents.patches {
+            Some(patches) => patches.to_string(),
+            None => "no".to_owned(),
+        };
+        let _ = writeln!(
+            text,
+            "  {:5}  {} scenes ({}) of {} base scenes; {patches} patches of {size}x{size} at stride {}",
+            split.to_string(),
+            contents.scenes,
+            sizes.join(", "),
+            contents.base_scenes.len(),
+            config.stride,
+            size = config.patch_size,
+        );
+        let bases: Vec<&str> = contents.base_scenes.iter().map(String::as_str).collect();
+        let _ = writeln!(text, "         {}", bases.join(", "));
+    }
+    let _ = writeln!(
+        text,
+        "\n{} split: {} pixels, {:.2} % misses, {} negative radiance samples (set to 0)",
+        report.split,
+        report.pixels,
+        100.0 * report.misses,
+        report.negative
+    );
+    let _ = writeln!(text, "  {:10}  {:>11}  {:>11}", "feature", "mean", "std");
+    for Feature { name, mean, std } in &report.features {
+        let (mean, std) = (
+            super::number(f64::from(*mean)),
+            super::number(f64::from(*std)),
+        );
+        let _ = writeln!(text, "  {name:10}  {mean:>11}  {std:>11}");
+    }
+    let [r, g, b] = report.flat_color;
+    let _ = writeln!(
+        text,
+        "  flat colour with the least RelMSE, in gamma space: {r:.4} {g:.4} {b:.4}"
+    );
+    text
+}

@@ -1,0 +1,259 @@
+//! A data set on disk: its `manifest.json`, its scenes and how they are split. Scenes are split by *base
+//! scene*: views of one room may never be on both sides.
+
+use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use rand::seq::SliceRandom;
+use serde::{Deserialize, Serialize};
+
+use crate::channel::Window;
+use crate::frame::{Presence, check_header};
+use crate::seed::{Use, generator};
+use crate::{ChannelLayout, Error};
+
+/// The manifest format that this version reads.
+const FORMAT: &str = "demc-exr 1";
+/// Problems listed in one message; the rest is counted.
+const PROBLEMS_LISTED: usize = 8;
+
+/// Which part of a data set a scene belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Split {
+    /// For training and validation.
+    Train,
+    /// For the final scores only.
+    Test,
+}
+
+impl fmt::Display for Split {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Split::Train => "train",
+            Split::Test => "test",
+        })
+    }
+}
+
+/// One image of a data set, as the manifest describes it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scene {
+    /// Its name, unique in the data set.
+    pub name: String,
+    /// The part it belongs to.
+    pub split: Split,
+    /// The base scene that it is a view of; never in two splits.
+    pub base: String,
+    /// Its file.
+    pub path: PathBuf,
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+    /// Expected RelMSE of the reference against a perfect one, where it is known.
+    pub ref_residual_relmse: Option<f64>,
+    /// The other keys of its manifest entry: licences, credits, render settings.
+    pub other: serde_json::Map<String, serde_json::Value>,
+}
+
+/// A data set whose manifest and file headers were checked.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Dataset {
+    /// Its directory.
+    pub root: PathBuf,
+    /// All scenes, in the manifest's order.
+    pub scenes: Vec<Scene>,
+}
+
+/// What any version of the format has.
+#[derive(Deserialize)]
+struct Head {
+    format: String,
+}
+
+#[derive(Deserialize)]
+struct Manifest {
+    scenes: Vec<Entry>,
+}
+
+#[derive(Deserialize)]
+struct Entry {
+    name: String,
+    split: Split,
+    base: String,
+    file: PathBuf,
+    width: usize,
+    height: usize,
+    ref_residual_relmse: Option<f64>,
+    #[serde(flatten)]
+    other: serde_json::Map<String, serde_json::Value>,
+}
+
+impl Dataset {
+    /// Opens `root/manifest.json` and checks that every scene's file is there, has the manifest's size, and
+    /// holds what `layout` names, the reference included. Decodes no pixels.
+    ///
+    /// # Errors
+    /// [`Error::Read`] without a manifest, otherwise [`Error::Dataset`] with every problem found.
+    pub fn open(root: &Path, layout: &ChannelLayout) -> Result<Self, Error> {
+        let path = root.join("manifest.json");
+        let text = std::fs::read_to_string(&path).map_err(|source| Error::Read { path, source })?;
+        let scenes = parse(root, &text).map_err(|problem| unusable(root, vec![problem]))?;
+        let mut problems = manifest_problems(&scenes);
+        if layout.reference.is_none() {
+            problems.push(
+                "the layout names no reference, and nothing can be learnt without one".to_owned(),
+            );
+        }
+        problems.extend(
+            scenes
+                .iter()
+                .filter_map(|scene| file_problem(scene, layout)),
+        );
+        match problems.is_empty() {
+            true => Ok(Self {
+                root: root.to_owned(),
+                scenes,
+            }),
+            false => Err(unusable(root, problems)),
+        }
+    }
+
+    /// The scenes of a split, in the manifest's order.
+    ///
+    /// # Errors
+    /// [`Error::Dataset`] if there are none.
+    pub fn split(&self, split: Split) -> Result<Vec<Scene>, Error> {
+        let scenes: Vec<Scene> = self
+            .scenes
+            .iter()
+            .filter(|scene| scene.split == split)
+            .cloned()
+            .collect();
+        match scenes.is_empty() {
+            true => Err(unusable(
+                &self.root,
+                vec![format!("no scene is in the {split} split")],
+            )),
+            false => Ok(scenes),
+        }
+    }
+
+    /// The training split, taken apart into scenes to train on and scenes to validate with: a `share` of its
+    /// *base* scenes (rounded, but one at least and not all) is held out, drawn by `seed`. A share of 0, or a
+    /// single base scene, leaves nothing to validate with.
+    ///
+    /// # Errors
+    /// [`Error::Dataset`] if the training split is empty.
+    pub fn train_validation(
+        &self,
+        share: f64,
+        seed: u64,
+    ) -> Result<(Vec<Scene>, Vec<Scene>), Error> {
+        let scenes = self.split(Split::Train)?;
+        let bases: BTreeSet<&str> = scenes.iter().map(|scene| scene.base.as_str()).collect();
+        // From a sorted list, so that the manifest's order does not matter.
+        let mut bases: Vec<&str> = bases.into_iter().collect();
+        bases.shuffle(&mut generator(Use::Validation, seed, 0, 0));
+        bases.truncate(held_out(share, bases.len()));
+        let held: HashSet<String> = bases.into_iter().map(str::to_owned).collect();
+        Ok(scenes
+            .into_iter()
+            .partition(|scene| !held.contains(&scene.base)))
+    }
+}
+
+/// How many of `bases` base scenes a `share` of them is.
+fn held_out(share: f64, bases: usize) -> usize {
+    if share <= 0.0 || bases < 2 {
+        return 0;
+    }
+    ((share * bases as f64).round() as usize).clamp(1, bases - 1)
+}
+
+fn parse(root: &Path, text: &str) -> Result<Vec<Scene>, String> {
+    let problem = |error: serde_json::Error| format!("manifest.json: {error}");
+    let Head { format } = serde_json::from_str(text).map_err(problem)?;
+    match format.strip_prefix(FORMAT) {
+        Some(minor) if !minor.starts_with(|c: char| c.is_ascii_digit()) => {}
+        _ => {
+            return Err(format!(
+                "manifest.json: format is {format:?}, expected {FORMAT:?}"
+            ));
+        }
+    }
+    let Manifest { scenes } = serde_json::from_str(text).map_err(problem)?;
+    let scene = |entry: Entry| Scene {
+        name: entry.name,
+        split: entry.split,
+        base: entry.base,
+        path: root.join(entry.file),
+        width: entry.width,
+        height: entry.height,
+        ref_residual_relmse: entry.ref_residual_relmse,
+        other: entry.other,
+    };
+    Ok(scenes.into_iter().map(scene).collect())
+}
+
+fn manifest_problems(scenes: &[Scene]) -> Vec<String> {
+    let mut problems = Vec::new();
+    if scenes.is_empty() {
+        problems.push("manifest.json lists no scenes".to_owned());
+    }
+    let mut names = HashSet::new();
+    let mut split_of: BTreeMap<&str, BTreeSet<Split>> = BTreeMap::new();
+    for scene in scenes {
+        if !names.insert(&scene.name) {
+            problems.push(format!("scene {} is listed twice", scene.name));
+        }
+        split_of.entry(&scene.base).or_default().insert(scene.split);
+    }
+    let leaks = split_of.iter().filter(|(_, splits)| splits.len() > 1);
+    problems.extend(leaks.map(|(base, _)| format!("base scene {base} is in train and in test")));
+    problems
+}
+
+fn file_problem(scene: &Scene, layout: &ChannelLayout) -> Option<String> {
+    match check_header(&scene.path, layout, Presence::Required) {
+        Ok(window) => {
+            size_mismatch(scene, window.width, window.height).map(|error| error.to_string())
+        }
+        Err(error) => Some(match std::error::Error::source(&error) {
+            Some(source) => format!("{error}: {source}"),
+            None => error.to_string(),
+        }),
+    }
+}
+
+/// The error for a file whose size is not what the manifest says.
+pub(crate) fn size_mismatch(scene: &Scene, width: usize, height: usize) -> Option<Error> {
+    let size = |width, height| {
+        Window {
+            x: 0,
+            y: 0,
+            width,
+            height,
+        }
+        .to_string()
+    };
+    ((width, height) != (scene.width, scene.height)).then(|| Error::SceneSize {
+        path: scene.path.clone(),
+        found: size(width, height),
+        expected: size(scene.width, scene.height),
+    })
+}
+
+fn unusable(root: &Path, mut problems: Vec<String>) -> Error {
+    let more = problems.len().saturating_sub(PROBLEMS_LISTED);
+    problems.truncate(PROBLEMS_LISTED);
+    if more > 0 {
+        problems.push(format!("and {more} more problems"));
+    }
+    Error::Dataset {
+        root: root.to_owned(),
+        problems,
+    }
+}

@@ -1,0 +1,278 @@
+//! One rendered image with its feature buffers, checked: all buffers cover the same pixels, nothing is NaN
+//! or infinite, no radiance is negative. [`FramePlanes`] keeps the file's precision, [`Frame`] is `f32`.
+
+use std::path::Path;
+
+use crate::Error;
+use crate::channel::Window;
+use crate::exr::ExrFile;
+use crate::layout::{ChannelLayout, Missing, Triple};
+use crate::plane::Plane;
+
+/// Number of feature channels: normal xyz, position xyz, texture RGB at the first and at the second vertex
+/// (Sec. 3.1).
+pub const FEATURES: usize = 12;
+
+/// The feature channels in the network's order.
+pub const FEATURE_NAMES: [&str; FEATURES] = [
+    "normal.x",
+    "normal.y",
+    "normal.z",
+    "position.x",
+    "position.y",
+    "position.z",
+    "texture1.r",
+    "texture1.g",
+    "texture1.b",
+    "texture2.r",
+    "texture2.g",
+    "texture2.b",
+];
+
+/// An image and its buffers as planar `f32`, in the renderer's own units.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Frame {
+    /// The file's name without directory and extension.
+    pub name: String,
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+    /// Noisy colour `[3, H, W]`: linear HDR radiance, not negative.
+    pub color: Vec<f32>,
+    /// Features `[12, H, W]` in the order of [`FEATURE_NAMES`], as rendered.
+    pub features: Vec<f32>,
+    /// Reference colour `[3, H, W]`, where the layout names it and the file has it.
+    pub reference: Option<Vec<f32>>,
+    /// Share of a pixel's camera rays that hit a surface `[H, W]`, where the layout names it and the file has it.
+    pub mask: Option<Vec<f32>>,
+    /// How many negative samples of colour and reference were set to 0.
+    pub clamped: usize,
+}
+
+/// Reads and checks an image. The reference and the mask are read where they are there.
+///
+/// # Errors
+/// [`Error::Read`] and [`Error::Exr`] for a file that cannot be decoded, [`Error::MissingChannels`],
+/// [`Error::Sizes`] and [`Error::NonFinite`] for buffers that cannot be used.
+pub fn read_frame(path: &Path, layout: &ChannelLayout) -> Result<Frame, Error> {
+    let planes = FramePlanes::read(path, layout, Presence::IfThere, Presence::IfThere)?;
+    let name = path
+        .file_stem()
+        .unwrap_or_default()
+        .to_string_lossy()
+        .into_owned();
+    Ok(Frame {
+        name,
+        width: planes.width,
+        height: planes.height,
+        color: planar(&planes.color),
+        features: planar(&planes.features),
+        reference: planes.reference.as_deref().map(planar),
+        mask: planes.mask.as_ref().map(Plane::to_f32),
+        clamped: planes.clamped,
+    })
+}
+
+/// An image's checked buffers in the precision of the file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FramePlanes {
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+    /// Noisy colour: 3 planes.
+    pub color: Vec<Plane>,
+    /// Features: 12 planes.
+    pub features: Vec<Plane>,
+    /// Reference colour: 3 planes.
+    pub reference: Option<Vec<Plane>>,
+    /// Share of the camera rays that hit.
+    pub mask: Option<Plane>,
+    /// How many negative samples of colour and reference were set to 0.
+    pub clamped: usize,
+}
+
+/// Whether a buffer that is not a feature is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Presence {
+    /// It is not read.
+    Skip,
+    /// It is read where the layout names it and the file has it.
+    IfThere,
+    /// It is read where the layout names it; a file without it is refused.
+    Required,
+}
+
+impl FramePlanes {
+    /// Reads and checks an image.
+    ///
+    /// # Errors
+    /// As [`read_frame`].
+    pub fn read(
+        path: &Path,
+        layout: &ChannelLayout,
+        reference: Presence,
+        mask: Presence,
+    ) -> Result<Self, Error> {
+        let file = ExrFile::open(path)?;
+        let plan = Plan::new(&file, layout, reference, mask)?;
+        let window = plan.window(path, &file)?;
+        let names = plan.names();
+        let mut decoded = names
+            .iter()
+            .copied()
+            .zip(file.read(&names)?)
+            .map(|(name, plane)| match plane.non_finite() {
+                None => Ok(plane),
+                Some((index, value, count)) => Err(Error::NonFinite {
+                    path: path.to_owned(),
+                    channel: name.to_owned(),
+                    value,
+                    x: index % window.width,
+                    y: index / window.width,
+                    count,
+                }),
+            });
+        let mut take = |slots: &[Option<&str>]| -> Result<Vec<Plane>, Error> {
+            let zeros = || Ok(Plane::zeros(window.width * window.height));
+            slots
+                .iter()
+                .map(|slot| slot.and_then(|_| decoded.next()).unwrap_or_else(zeros))
+                .collect()
+        };
+        let mut planes = Self {
+            width: window.width,
+            height: window.height,
+            color: take(&plan.color)?,
+            features: take(&plan.features)?,
+            reference: plan.reference.as_deref().map(&mut take).transpose()?,
+            mask: take(&plan.mask)?.pop(),
+            clamped: 0,
+        };
+        let radiance = planes
+            .color
+            .iter_mut()
+            .chain(planes.reference.iter_mut().flatten());
+        planes.clamped = radiance.map(Plane::clamp_negative).sum();
+        Ok(planes)
+    }
+
+    /// Memory of all samples, in bytes.
+    pub fn bytes(&self) -> usize {
+        let radiance = self.color.iter().chain(self.reference.iter().flatten());
+        radiance
+            .chain(&self.features)
+            .chain(&self.mask)
+            .map(Plane::bytes)
+            .sum()
+    }
+}
+
+/// Checks a file's header: it has what the layout and `reference` ask for, in buffers of one size. Decodes
+/// no pixels.
+///
+/// # Errors
+/// As [`read_frame`], pixel data aside.
+pub fn check_header(
+    path: &Path,
+    layout: &ChannelLayout,
+    reference: Presence,
+) -> Result<Window, Error> {
+    let file = ExrFile::open(path)?;
+    Plan::new(&file, layout, reference, Presence::IfThere)?.window(path, &file)
+}
+
+/// Which channel goes where; `None` stands for zeros.
+struct Plan<'a> {
+    color: Vec<Option<&'a str>>,
+    features: Vec<Option<&'a str>>,
+    reference: Option<Vec<Option<&'a str>>>,
+    mask: Vec<Option<&'a str>>,
+}
+
+impl<'a> Plan<'a> {
+    fn new(
+        file: &ExrFile,
+        layout: &'a ChannelLayout,
+        reference: Presence,
+        mask: Presence,
+    ) -> Result<Self, Error> {
+        let there = |names: &[String]| names.iter().any(|name| file.channel(name).is_some());
+        let read = |presence: Presence, names: &[String]| match presence {
+            Presence::Skip => false,
+            Presence::IfThere => there(names),
+            Presence::Required => true,
+        };
+        let mut features: Vec<Option<&str>> = Vec::with_capacity(FEATURES);
+        for (buffer, names, missing) in layout.features() {
+            match (names, missing) {
+                // One channel of three is enough to be there: the others are then missing, whatever the policy.
+                (Some(names), policy) if policy == Missing::Error || there(names) => {
+                    features.extend(slots(names))
+                }
+                (None, Missing::Error) => {
+                    let detail = format!("{buffer} names no channels and has no policy");
+                    return Err(Error::Layout {
+                        name: "in use".to_owned(),
+                        detail,
+                    });
+                }
+                (_, Missing::CopyTexture1) => features.extend_from_within(6..9),
+                _ => features.extend([None; 3]),
+            }
+        }
+        let reference = layout
+            .reference
+            .as_ref()
+            .filter(|names| read(reference, &names[..]));
+        let mask = layout
+            .mask
+            .iter()
+            .filter(|name| read(mask, std::slice::from_ref(name)));
+        let plan = Self {
+            color: slots(&layout.color),
+            features,
+            reference: reference.map(slots),
+            mask: mask.map(|name| Some(name.as_str())).collect(),
+        };
+        file.require(&plan.names())?;
+        Ok(plan)
+    }
+
+    /// The channels to decode, in the order of the fields; a copied texture comes twice.
+    fn names(&self) -> Vec<&'a str> {
+        let radiance_and_features = self.color.iter().chain(&self.features);
+        radiance_and_features
+            .chain(self.reference.iter().flatten())
+            .chain(&self.mask)
+            .copied()
+            .flatten()
+            .collect()
+    }
+
+    /// The window that all channels have in common.
+    fn window(&self, path: &Path, file: &ExrFile) -> Result<Window, Error> {
+        let names = self.names();
+        let mut channels = names.iter().filter_map(|name| file.channel(name));
+        let first = channels.next().expect("colour is always in the plan");
+        match channels.find(|channel| channel.window != first.window) {
+            None => Ok(first.window),
+            Some(other) => Err(Error::Sizes {
+                path: path.to_owned(),
+                a: first.name.clone(),
+                a_window: first.window.to_string(),
+                b: other.name.clone(),
+                b_window: other.window.to_string(),
+            }),
+        }
+    }
+}
+
+fn slots(names: &Triple) -> Vec<Option<&str>> {
+    names.iter().map(|name| Some(name.as_str())).collect()
+}
+
+fn planar<'a>(planes: impl IntoIterator<Item = &'a Plane>) -> Vec<f32> {
+    planes.into_iter().flat_map(Plane::to_f32).collect()
+}

@@ -1,0 +1,87 @@
+//! Batches made ahead of their use on background threads. Worker w of W makes batches w, w + W, w + 2 W, ...
+//! and hands them over through a channel of its own; the consumer takes from the channels in turn. So the
+//! order is that of the stream whatever the threads do, and no more than two batches a worker wait.
+
+use std::panic::resume_unwind;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::thread::{self, JoinHandle};
+
+use crate::{Batch, Error, PatchSource};
+
+/// Finished batches that a worker may have waiting while it makes the next one. A batch of 64 patches of
+/// 128 x 128 is 75 MB.
+const AHEAD: usize = 1;
+
+/// Delivers the batches of a run in order. Dropping it ends and joins its threads.
+pub struct BatchLoader {
+    workers: Vec<Worker>,
+    turn: usize,
+}
+
+struct Worker {
+    /// `None` only while the loader is dropped.
+    batches: Option<Receiver<Result<Batch, Error>>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl BatchLoader {
+    /// Starts `source.workers()` threads; the first batch delivered is `start`.
+    pub fn new(source: Arc<PatchSource>, start: u64) -> Self {
+        let stride = source.workers().max(1);
+        let worker = |first: u64| {
+            let source = Arc::clone(&source);
+            let (sender, batches) = sync_channel(AHEAD);
+            let thread = thread::spawn(move || {
+                for n in (first..).step_by(stride) {
+                    // The receiver is gone when the loader was dropped.
+                    if sender.send(source.batch(n)).is_err() {
+                        break;
+                    }
+                }
+            });
+            Worker {
+                batches: Some(batches),
+                thread: Some(thread),
+            }
+        };
+        let workers = (start..).take(stride).map(worker).collect();
+        Self { workers, turn: 0 }
+    }
+
+    /// Waits for the next batch.
+    ///
+    /// # Errors
+    /// As [`PatchSource::batch`], at the batch that the scene was needed for.
+    #[expect(
+        clippy::should_implement_trait,
+        reason = "the stream is endless: an Option would never be None"
+    )]
+    pub fn next(&mut self) -> Result<Batch, Error> {
+        let turn = self.turn;
+        self.turn = (turn + 1) % self.workers.len();
+        let worker = &mut self.workers[turn];
+        let batches = worker.batches.as_ref().expect("it is there until the drop");
+        batches
+            .recv()
+            .unwrap_or_else(|_| match worker.thread.take().map(JoinHandle::join) {
+                Some(Err(panic)) => resume_unwind(panic),
+                _ => unreachable!("a worker only ends when its receiver is dropped"),
+            })
+    }
+}
+
+impl Drop for BatchLoader {
+    fn drop(&mut self) {
+        // All receivers first: every worker then stops at its next delivery.
+        for worker in &mut self.workers {
+            worker.batches = None;
+        }
+        for worker in &mut self.workers {
+            if let Some(thread) = worker.thread.take() {
+                // A panic was reported by the thread itself, and a drop must not panic.
+                let _ = thread.join();
+            }
+        }
+    }
+}

@@ -1,0 +1,173 @@
+//! Which pixels a training example is cut from, and in which order: patches on a grid over every scene
+//! (Sec. 4.2: 128 x 128 at stride 80), shuffled anew each epoch. A patch is an index, never a file.
+
+use rand::seq::SliceRandom;
+use serde::{Deserialize, Serialize};
+
+use crate::seed::{Use, generator};
+use crate::{Error, Scene};
+
+/// A square of a scene.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Patch {
+    /// Index of the scene in the list that the patches were made from.
+    pub scene: u32,
+    /// Top edge, in pixels.
+    pub y: u32,
+    /// Left edge, in pixels.
+    pub x: u32,
+}
+
+/// What happens at the right and lower edge, where the grid leaves pixels over (ours: the paper is silent).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Border {
+    /// A last column and row of patches, moved to the edge: every pixel is in some patch.
+    Shift,
+    /// They are left out.
+    Drop,
+}
+
+/// All patches of `scenes`: scene by scene, row by row.
+///
+/// # Errors
+/// [`Error::SceneTooSmall`], naming the first scene that holds no patch.
+///
+/// # Panics
+/// If `size` or `stride` is 0.
+pub fn patches(
+    scenes: &[Scene],
+    size: usize,
+    stride: usize,
+    border: Border,
+) -> Result<Vec<Patch>, Error> {
+    let mut patches = Vec::new();
+    for (index, scene) in scenes.iter().enumerate() {
+        let rows = origins(scene.height, size, stride, border);
+        let columns = origins(scene.width, size, stride, border);
+        if rows.is_empty() || columns.is_empty() {
+            let (width, height) = (scene.width, scene.height);
+            return Err(Error::SceneTooSmall {
+                scene: scene.name.clone(),
+                width,
+                height,
+                patch: size,
+            });
+        }
+        for &y in &rows {
+            patches.extend(columns.iter().map(|&x| Patch {
+                scene: index as u32,
+                y,
+                x,
+            }));
+        }
+    }
+    Ok(patches)
+}
+
+/// Where patches of `size` start along an edge of `length` pixels; empty if none fits.
+fn origins(length: usize, size: usize, stride: usize, border: Border) -> Vec<u32> {
+    assert!(
+        size > 0 && stride > 0,
+        "patch size {size} and stride {stride} must be positive"
+    );
+    let Some(last) = length.checked_sub(size) else {
+        return Vec::new();
+    };
+    let mut origins: Vec<u32> = (0..=last)
+        .step_by(stride)
+        .map(|origin| origin as u32)
+        .collect();
+    if border == Border::Shift && last % stride != 0 {
+        origins.push(last as u32);
+    }
+    origins
+}
+
+/// The order in which epoch `epoch` visits `count` patches: a permutation of `0..count` that depends on
+/// `seed` and `epoch` only.
+pub fn epoch_order(count: usize, seed: u64, epoch: u64) -> Vec<u32> {
+    let mut order: Vec<u32> = (0..count as u32).collect();
+    order.shuffle(&mut generator(Use::Shuffle, seed, epoch, 0));
+    order
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Split;
+
+    fn scene(name: &str, width: usize, height: usize) -> Scene {
+        Scene {
+            name: name.to_owned(),
+            split: Split::Train,
+            base: name.to_owned(),
+            path: "none.exr".into(),
+            width,
+            height,
+            ref_residual_relmse: None,
+            other: serde_json::Map::new(),
+        }
+    }
+
+    #[test]
+    fn shift_reaches_the_edge_and_drop_does_not() {
+        assert_eq!(origins(300, 128, 80, Border::Drop), [0, 80, 160]);
+        assert_eq!(origins(300, 128, 80, Border::Shift), [0, 80, 160, 172]);
+    }
+
+    #[test]
+    fn a_grid_that_fits_exactly_is_not_doubled_at_the_edge() {
+        assert_eq!(origins(288, 128, 80, Border::Shift), [0, 80, 160]);
+        assert_eq!(origins(128, 128, 80, Border::Shift), [0]);
+    }
+
+    #[test]
+    fn shifted_patches_cover_every_pixel() {
+        for length in 128..420 {
+            let mut covered = vec![false; length];
+            for origin in origins(length, 128, 80, Border::Shift) {
+                covered[origin as usize..][..128].fill(true);
+            }
+            assert!(covered.into_iter().all(|pixel| pixel), "length {length}");
+        }
+    }
+
+    #[test]
+    fn a_hd_scene_has_16_by_9_patches() {
+        let patches =
+            patches(&[scene("a", 1280, 720)], 128, 80, Border::Shift).expect("large enough");
+        assert_eq!(patches.len(), 16 * 9);
+        assert_eq!(
+            patches[143],
+            Patch {
+                scene: 0,
+                y: 592,
+                x: 1152
+            }
+        );
+    }
+
+    #[test]
+    fn a_scene_smaller_than_a_patch_is_named() {
+        let scenes = [scene("large", 200, 200), scene("narrow", 127, 500)];
+        let error = patches(&scenes, 128, 80, Border::Shift)
+            .expect_err("too small")
+            .to_string();
+        assert_eq!(
+            error,
+            "scene narrow: 127x500 pixels hold no patch of 128x128"
+        );
+    }
+
+    #[test]
+    fn an_epoch_visits_every_patch_once_in_its_own_order() {
+        let order = epoch_order(90, 7, 3);
+        let mut sorted = order.clone();
+        sorted.sort_unstable();
+        assert_eq!(sorted, (0..90).collect::<Vec<u32>>());
+        assert_eq!(order, epoch_order(90, 7, 3));
+        assert_ne!(order, epoch_order(90, 7, 4));
+        assert_ne!(order, epoch_order(90, 8, 3));
+    }
+}

@@ -1,0 +1,152 @@
+//! One channel of an image in the precision that its file has: half planes stay half in the scene cache,
+//! at half the memory.
+
+use half::f16;
+use half::slice::HalfFloatSliceExt;
+
+/// The samples of one channel, row by row, `[H, W]`.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Plane {
+    /// 16-bit floating point.
+    Half(Vec<f16>),
+    /// 32-bit floating point.
+    Float(Vec<f32>),
+    /// 32-bit unsigned integers.
+    Uint(Vec<u32>),
+}
+
+impl Plane {
+    /// A half plane of `samples` zeros: what stands in for a buffer that a layout declares as zeros.
+    pub fn zeros(samples: usize) -> Self {
+        Plane::Half(vec![f16::ZERO; samples])
+    }
+
+    /// Number of samples.
+    pub fn len(&self) -> usize {
+        match self {
+            Plane::Half(samples) => samples.len(),
+            Plane::Float(samples) => samples.len(),
+            Plane::Uint(samples) => samples.len(),
+        }
+    }
+
+    /// Whether there are no samples.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Memory of the samples, in bytes.
+    pub fn bytes(&self) -> usize {
+        self.len() * if matches!(self, Plane::Half(_)) { 2 } else { 4 }
+    }
+
+    /// Writes the samples from `start` on as `f32` to `out`, as many as it takes.
+    ///
+    /// # Panics
+    /// If the plane ends before `out` is full.
+    pub fn copy_to(&self, start: usize, out: &mut [f32]) {
+        let end = start + out.len();
+        match self {
+            Plane::Half(samples) => samples[start..end].convert_to_f32_slice(out),
+            Plane::Float(samples) => out.copy_from_slice(&samples[start..end]),
+            Plane::Uint(samples) => {
+                for (out, &sample) in out.iter_mut().zip(&samples[start..end]) {
+                    *out = sample as f32;
+                }
+            }
+        }
+    }
+
+    /// All samples as `f32`.
+    pub fn to_f32(&self) -> Vec<f32> {
+        let mut out = vec![0.0; self.len()];
+        self.copy_to(0, &mut out);
+        out
+    }
+
+    /// The first NaN or infinite sample (index and value) and how many there are, or `None`.
+    pub fn non_finite(&self) -> Option<(usize, f32, usize)> {
+        let bad: (Option<(usize, f32)>, usize) = match self {
+            Plane::Half(samples) => count_bad(samples.iter().map(|s| (s.is_finite(), s.to_f32()))),
+            Plane::Float(samples) => count_bad(samples.iter().map(|s| (s.is_finite(), *s))),
+            Plane::Uint(_) => (None, 0),
+        };
+        bad.0.map(|(index, value)| (index, value, bad.1))
+    }
+
+    /// Sets negative samples to 0 and returns how many there were (-0 is not negative).
+    pub fn clamp_negative(&mut self) -> usize {
+        match self {
+            Plane::Half(samples) => clamp(samples, f16::ZERO),
+            Plane::Float(samples) => clamp(samples, 0.0),
+            Plane::Uint(_) => 0,
+        }
+    }
+}
+
+fn count_bad(samples: impl Iterator<Item = (bool, f32)>) -> (Option<(usize, f32)>, usize) {
+    let mut first = None;
+    let mut count = 0;
+    for (index, (finite, value)) in samples.enumerate() {
+        if !finite {
+            first = first.or(Some((index, value)));
+            count += 1;
+        }
+    }
+    (first, count)
+}
+
+fn clamp<T: PartialOrd + Copy>(samples: &mut [T], zero: T) -> usize {
+    let mut clamped = 0;
+    for sample in samples.iter_mut().filter(|sample| **sample < zero) {
+        *sample = zero;
+        clamped += 1;
+    }
+    clamped
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn half(samples: &[f32]) -> Plane {
+        Plane::Half(samples.iter().map(|&s| f16::from_f32(s)).collect())
+    }
+
+    #[test]
+    fn a_part_of_every_precision_reads_as_the_same_numbers() {
+        for plane in [
+            half(&[0.0, 1.0, 2.0, 3.0]),
+            Plane::Float(vec![0.0, 1.0, 2.0, 3.0]),
+            Plane::Uint(vec![0, 1, 2, 3]),
+        ] {
+            let mut out = [0.0; 2];
+            plane.copy_to(1, &mut out);
+            assert_eq!(out, [1.0, 2.0]);
+            assert_eq!(plane.to_f32(), [0.0, 1.0, 2.0, 3.0]);
+        }
+    }
+
+    #[test]
+    fn half_planes_take_half_the_memory() {
+        assert_eq!(half(&[1.0; 6]).bytes(), 12);
+        assert_eq!(Plane::Float(vec![1.0; 6]).bytes(), 24);
+    }
+
+    #[test]
+    fn the_first_bad_sample_is_named_and_all_are_counted() {
+        let (index, value, count) = half(&[0.0, f32::INFINITY, 2.0, f32::NAN])
+            .non_finite()
+            .expect("two bad samples");
+        assert_eq!((index, value, count), (1, f32::INFINITY, 2));
+        assert!(half(&[1.0]).non_finite().is_none());
+    }
+
+    #[test]
+    fn only_negative_samples_are_clamped() {
+        let mut plane = Plane::Float(vec![-1.0, -0.0, 0.0, 2.0, -3.0]);
+        assert_eq!(plane.clamp_negative(), 2);
+        assert_eq!(plane.to_f32(), [0.0, 0.0, 0.0, 2.0, 0.0]);
+        assert_eq!(half(&[-1.0, 1.0]).clamp_negative(), 1);
+    }
+}

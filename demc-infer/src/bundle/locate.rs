@@ -1,0 +1,77 @@
+//! From what a user calls a model to the file: a run directory, a checkpoint directory or a bundle.
+//!
+//! ```text
+//! RUN/best.safetensors                                   the best weights of validation
+//! RUN/latest                                             text: name of the newest checkpoint, step-00000500
+//! RUN/checkpoints/step-00000500/model.safetensors        a checkpoint
+//! ```
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::BundleError;
+
+/// Best weights of a run, by validation.
+pub const BEST: &str = "best.safetensors";
+/// Text file of a run with the name of the newest checkpoint.
+pub const LATEST: &str = "latest";
+/// Directory of a run with the checkpoints.
+pub const CHECKPOINTS: &str = "checkpoints";
+/// Weights of a checkpoint.
+pub const MODEL: &str = "model.safetensors";
+
+/// The bundle file that `path` stands for.
+///
+/// # Errors
+/// A directory without one, or a `latest` that cannot be read.
+pub(super) fn locate(path: &Path) -> Result<PathBuf, BundleError> {
+    if !path.is_dir() {
+        return Ok(path.into());
+    }
+    for file in [BEST, MODEL] {
+        let file = path.join(file);
+        if file.exists() {
+            return Ok(file);
+        }
+    }
+    let latest = path.join(LATEST);
+    if !latest.exists() {
+        return Err(BundleError::NoModel { path: path.into() });
+    }
+    let checkpoint = fs::read_to_string(&latest).map_err(|source| BundleError::Read {
+        path: latest,
+        source,
+    })?;
+    Ok(path.join(CHECKPOINTS).join(checkpoint.trim()).join(MODEL))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_gives_its_best_weights_else_its_latest_checkpoint() -> std::io::Result<()> {
+        let dir = tempfile::tempdir()?;
+        let run = dir.path();
+        let error = locate(run).expect_err("empty").to_string();
+        assert!(
+            error.contains("neither a run directory nor a checkpoint"),
+            "{error}"
+        );
+
+        let checkpoint = run.join("checkpoints/step-00000500");
+        fs::create_dir_all(&checkpoint)?;
+        fs::write(run.join("latest"), "step-00000500\n")?;
+        let model = checkpoint.join("model.safetensors");
+        assert_eq!(locate(run).expect("latest"), model);
+
+        fs::write(&model, "")?;
+        assert_eq!(locate(&checkpoint).expect("checkpoint"), model);
+
+        let best = run.join("best.safetensors");
+        fs::write(&best, "")?;
+        assert_eq!(locate(run).expect("best"), best);
+        assert_eq!(locate(&best).expect("file"), best);
+        Ok(())
+    }
+}

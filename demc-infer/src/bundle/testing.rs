@@ -1,0 +1,52 @@
+//! A tiny network with random weights and a frame with a pattern, for the tests of this crate.
+
+use burn::tensor::Device;
+use demc_data::{ChannelLayout, FEATURES, FeatureStats, Frame, Normalizer};
+use demc_model::{Head, ModelConfig, Reading, Variant};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+
+use super::{Bundle, BundleMeta};
+
+/// Base width 2, the released reading: it has batch normalisation in most places.
+pub(crate) fn bundle(variant: Variant) -> Bundle {
+    let model = ModelConfig {
+        variant,
+        reading: Reading::Released,
+        width: 2,
+        head: Head::Grey,
+    };
+    let features = FeatureStats {
+        mean: std::array::from_fn(|channel| 0.1 * channel as f32),
+        std: std::array::from_fn(|channel| 0.3 + 0.1 * channel as f32),
+    };
+    let normalizer = Normalizer {
+        gamma: 2.2,
+        features,
+        flat_color: [0.4, 0.3, 0.2],
+    };
+    let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    Bundle {
+        model: model.init(&mut rng, normalizer.flat_color, &Device::flex()),
+        meta: BundleMeta::new(model, normalizer, layout, 12),
+    }
+}
+
+/// A frame without reference whose values follow a pattern, 0 to 1.
+pub(crate) fn frame(width: usize, height: usize) -> Frame {
+    let pattern = |channels: usize| {
+        let values = 0..channels * width * height;
+        values.map(|i| (i * 7919 % 1013) as f32 / 1013.0).collect()
+    };
+    Frame {
+        name: "pattern".into(),
+        width,
+        height,
+        color: pattern(3),
+        features: pattern(FEATURES),
+        reference: None,
+        mask: None,
+        clamped: 0,
+    }
+}

@@ -1,0 +1,213 @@
+//! Tests of the bundle as a whole: round trips, and every way in which a file can be wrong.
+
+use std::collections::HashMap;
+use std::fs;
+
+use demc_model::Variant;
+use safetensors::tensor::{Dtype, TensorView};
+
+use super::testing::bundle;
+use super::*;
+
+const STYLES: [(Names, Precision); 4] = [
+    (Names::Burn, Precision::F32),
+    (Names::Torch, Precision::F32),
+    (Names::Burn, Precision::F16),
+    (Names::Torch, Precision::F16),
+];
+
+/// A tensor list to edit, and back to a file.
+type Tensors = Vec<(String, Dtype, Vec<usize>, Vec<u8>)>;
+
+/// The error of loading `tensors` with the metadata `header` under the key `demc`.
+fn load_error(tensors: &Tensors, header: Option<&str>) -> String {
+    let views = tensors.iter().map(|(name, dtype, shape, bytes)| {
+        (
+            name,
+            TensorView::new(*dtype, shape.clone(), bytes).expect("view"),
+        )
+    });
+    let metadata = header.map(|text| HashMap::from([("demc".to_string(), text.to_string())]));
+    error_of(&safetensors::serialize(views, metadata).expect("bytes"))
+}
+
+/// The error of loading a file with these bytes, its path taken off.
+fn error_of(bytes: &[u8]) -> String {
+    let dir = tempfile::tempdir().expect("directory");
+    let path = dir.path().join("x.safetensors");
+    fs::write(&path, bytes).expect("written");
+    let error = Bundle::load(&path, &Device::flex()).expect_err("refused");
+    let chain: Vec<_> =
+        std::iter::successors(Some(&error as &dyn std::error::Error), |e| e.source())
+            .map(|e| e.to_string())
+            .collect();
+    let line = chain.join(": ");
+    assert!(!line.contains('\n'), "one line: {line}");
+    line.strip_prefix(&format!("{}: ", path.display()))
+        .expect("path first")
+        .into()
+}
+
+/// The parts of a good file: tensors and header.
+fn good() -> (Tensors, String) {
+    let bundle = bundle(Variant::Demc);
+    let bytes = encode::encode(
+        &bundle.meta,
+        bundle.model.weights(),
+        Names::Burn,
+        Precision::F32,
+    )
+    .expect("bytes");
+    let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).expect("header");
+    let entry = header.metadata().as_ref().expect("metadata")["demc"].clone();
+    let tensors = safetensors::SafeTensors::deserialize(&bytes).expect("tensors");
+    let tensors = tensors.tensors().into_iter().map(|(name, view)| {
+        (
+            name,
+            view.dtype(),
+            view.shape().to_vec(),
+            view.data().to_vec(),
+        )
+    });
+    (tensors.collect(), entry)
+}
+
+#[test]
+fn every_style_comes_back_as_it_was() {
+    for variant in Variant::ALL {
+        let bundle = bundle(variant);
+        for (names, precision) in STYLES {
+            let dir = tempfile::tempdir().expect("directory");
+            let path = dir.path().join("x.safetensors");
+            bundle
+                .export(&path, names, precision)
+                .expect("exported and compared");
+            let back = Bundle::load(&path, &Device::flex()).expect("loaded");
+            assert_eq!(back.meta, bundle.meta);
+            if precision == Precision::F32 {
+                assert_eq!(back.model.weights(), bundle.model.weights());
+            }
+        }
+    }
+}
+
+#[test]
+fn f16_halves_the_convolutions_and_leaves_batch_normalisation() {
+    let bundle = bundle(Variant::Demc);
+    let bytes = encode::encode(
+        &bundle.meta,
+        bundle.model.weights(),
+        Names::Torch,
+        Precision::F16,
+    )
+    .expect("bytes");
+    let tensors = safetensors::SafeTensors::deserialize(&bytes).expect("tensors");
+    let dtype = |name: &str| tensors.tensor(name).expect(name).dtype();
+    assert_eq!(dtype("decoder.head.weight"), Dtype::F16);
+    assert_eq!(dtype("fusion.blocks.1.norm.weight"), Dtype::F32);
+    assert_eq!(dtype("latent.norm.running_var"), Dtype::F32);
+}
+
+#[test]
+fn equal_bundles_give_equal_bytes() {
+    let bytes = || {
+        let bundle = bundle(Variant::Semc);
+        encode::encode(
+            &bundle.meta,
+            bundle.model.weights(),
+            Names::Burn,
+            Precision::F16,
+        )
+        .expect("bytes")
+    };
+    let first = bytes();
+    assert!((0..8).all(|_| bytes() == first));
+}
+
+#[test]
+fn a_file_cut_short_anywhere_is_refused() {
+    let bundle = bundle(Variant::Demc);
+    let bytes = encode::encode(
+        &bundle.meta,
+        bundle.model.weights(),
+        Names::Burn,
+        Precision::F32,
+    )
+    .expect("bytes");
+    for length in [0, 7, 100, bytes.len() / 2, bytes.len() - 1] {
+        let error = error_of(&bytes[..length]);
+        assert!(
+            error.starts_with("cut short, damaged or no safetensors file: "),
+            "{error}"
+        );
+    }
+    assert!(error_of(b"v/1\x01 an OpenEXR file, say").starts_with("cut short"));
+}
+
+#[test]
+fn files_of_others_and_of_other_versions_are_refused() {
+    let (tensors, header) = good();
+    assert!(load_error(&tensors, None).contains("no DEMC bundle"));
+    let newer = header.replacen("\"format\":1", "\"format\":2", 1);
+    assert_eq!(
+        load_error(&tensors, Some(&newer)),
+        "bundle format 2; this build reads format 1"
+    );
+    let broken = header.replacen("\"variant\"", "\"varient\"", 1);
+    assert!(
+        load_error(&tensors, Some(&broken))
+            .starts_with("header entry `demc`: unknown field `varient`")
+    );
+}
+
+#[test]
+fn statistics_that_divide_by_zero_are_refused() {
+    let (tensors, header) = good();
+    let zero = header.replacen("\"std\":[0.3", "\"std\":[0.0", 1);
+    let error = load_error(&tensors, Some(&zero));
+    assert!(
+        error.contains("normalizer.features: normal.x: mean 0, std 0"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_tensor_that_does_not_fit_is_named() {
+    let (mut tensors, header) = good();
+    let head = tensors
+        .iter()
+        .position(|t| t.0 == "decoder.head.bias")
+        .expect("head");
+
+    let mut missing = tensors.clone();
+    missing.remove(head);
+    assert_eq!(
+        load_error(&missing, Some(&header)),
+        "weight decoder.head.bias is missing"
+    );
+
+    let mut extra = tensors.clone();
+    extra.push(("decoder.tail".into(), Dtype::F32, vec![1], vec![0; 4]));
+    assert!(load_error(&extra, Some(&header)).contains("weight decoder.tail does not belong"));
+
+    let mut misshaped = tensors.clone();
+    misshaped[head].2 = vec![3, 1];
+    let error = load_error(&misshaped, Some(&header));
+    assert_eq!(
+        error,
+        "weight decoder.head.bias: expected shape [3], found [3, 1]"
+    );
+
+    let mut nan = tensors.clone();
+    nan[head].3[..4].copy_from_slice(&f32::NAN.to_le_bytes());
+    assert_eq!(
+        load_error(&nan, Some(&header)),
+        "tensor decoder.head.bias: NaN among its values"
+    );
+
+    tensors[head].1 = Dtype::I32;
+    assert_eq!(
+        load_error(&tensors, Some(&header)),
+        "tensor decoder.head.bias: type I32; expected F32 or F16"
+    );
+}

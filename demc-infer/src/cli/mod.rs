@@ -1,0 +1,122 @@
+//! The command line: flags, exit codes, and what is printed where.
+//!
+//! Results go to stdout, progress and errors to stderr. Exit code 0: done; 1: the run, or a file of it, failed; 2: the
+//! command line asks for something that cannot be.
+
+mod denoise;
+mod evaluate;
+mod export;
+mod inspect;
+
+use std::path::{Path, PathBuf};
+
+use burn::tensor::Device;
+use clap::{Args, Parser, Subcommand};
+use demc_infer::{Bundle, device};
+
+/// Use a trained DEMC network: denoise renders, score it, export its weights.
+#[derive(Parser)]
+#[command(
+    version,
+    after_help = "MODEL is a run directory of demc-train (its best weights), a checkpoint \
+    directory, or a file that `export` wrote.\n\nExit code: 0 done, 1 something failed, 2 wrong command line."
+)]
+pub struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    Denoise(denoise::Denoise),
+    Evaluate(evaluate::Evaluate),
+    Export(export::Export),
+    Inspect(inspect::Inspect),
+}
+
+/// Something asked for on the command line that cannot be: exit code 2.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct Usage(String);
+
+/// Runs the command.
+pub fn run(arguments: Arguments) -> anyhow::Result<()> {
+    match arguments.command {
+        Command::Denoise(command) => command.run(),
+        Command::Evaluate(command) => command.run(),
+        Command::Export(command) => command.run(),
+        Command::Inspect(command) => command.run(),
+    }
+}
+
+/// `--model`, which every command has.
+#[derive(Args)]
+struct Model {
+    /// Run directory, checkpoint directory or exported file
+    #[arg(long = "model", value_name = "MODEL")]
+    path: PathBuf,
+}
+
+/// `--device`, for the commands that compute.
+#[derive(Args)]
+struct DeviceFlag {
+    /// What computes: flex (CPU, always there), or ndarray, wgpu[:N], cuda[:N] where built in
+    #[arg(long = "device", value_name = "DEVICE", default_value = "flex")]
+    name: String,
+}
+
+impl Model {
+    /// Loads onto the device called `name`.
+    fn load_onto(&self, device: &DeviceFlag) -> anyhow::Result<Bundle> {
+        let device = device::parse(&device.name).map_err(|error| Usage(error.to_string()))?;
+        Ok(Bundle::load(&self.path, &device)?)
+    }
+
+    /// Loads onto the CPU, for commands that only look at the weights.
+    fn load(&self) -> anyhow::Result<Bundle> {
+        Ok(Bundle::load(&self.path, &Device::flex())?)
+    }
+}
+
+/// Counts negative radiance, to be reported once whatever the number of images.
+#[derive(Default)]
+struct Clamped {
+    samples: usize,
+    images: usize,
+}
+
+impl Clamped {
+    /// An image with `samples` negative values that were set to 0.
+    fn count(&mut self, samples: usize) {
+        self.samples += samples;
+        self.images += usize::from(samples > 0);
+    }
+
+    /// Says it on stderr, if there is anything to say.
+    fn report(self) {
+        let Self { samples, images } = self;
+        if samples > 0 {
+            eprintln!("note: {samples} negative radiance sample(s) in {images} image(s) set to 0");
+        }
+    }
+}
+
+/// Writes `text` and a line end to stdout for `-`, else to a file.
+fn write_text(path: &Path, text: &str) -> anyhow::Result<()> {
+    if path == Path::new("-") {
+        return print(text);
+    }
+    demc_data::file::write_whole(path, |file| {
+        std::io::Write::write_all(file, format!("{text}\n").as_bytes())
+    })?;
+    Ok(())
+}
+
+/// Prints a line to stdout. A reader that has heard enough (`| head`) is no failure.
+fn print(text: &str) -> anyhow::Result<()> {
+    use std::io::{ErrorKind, Write};
+    match writeln!(std::io::stdout(), "{text}") {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(error.into()),
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,219 @@
+//! A frame to its denoised image: gamma and Z-score, padding, the network, cropping, back to linear HDR.
+
+use burn::module::Module;
+use burn::tensor::{Device, Tensor, TensorData, TensorReadError};
+use demc_data::{FEATURES, Frame};
+use demc_model::config::COLOR_CHANNELS;
+
+use crate::Bundle;
+use crate::padding::Padding;
+
+/// Why a frame could not be denoised.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum DenoiseError {
+    /// The frame's buffers do not have the size that it claims.
+    #[error("{name}: {buffer} holds {found} values; {width}x{height} pixels need {expected}")]
+    Size {
+        /// The frame.
+        name: String,
+        /// The buffer.
+        buffer: &'static str,
+        /// Its length.
+        found: usize,
+        /// What it should be.
+        expected: usize,
+        /// The frame's width in pixels.
+        width: usize,
+        /// The frame's height in pixels.
+        height: usize,
+    },
+    /// The network's output is not a number everywhere.
+    #[error(
+        "{name}: {count} NaN or infinite values in the network's output: the image does not fit the training data's statistics, or the weights are damaged"
+    )]
+    NonFinite {
+        /// The frame.
+        name: String,
+        /// How many.
+        count: usize,
+    },
+    /// The device could not compute or hand over the image.
+    #[error("{name}: the device failed")]
+    Device {
+        /// The frame.
+        name: String,
+        /// What the device said.
+        source: TensorReadError,
+    },
+    /// There is nothing to compare with.
+    #[error("{name}: no reference in the file")]
+    NoReference {
+        /// The frame.
+        name: String,
+    },
+}
+
+impl Bundle {
+    /// Denoises `frame`, whatever its size: padded by edge replication to multiples of 32, then cropped.
+    ///
+    /// # Shapes
+    /// Returns planar `[3, H, W]` in linear HDR, not negative.
+    ///
+    /// # Errors
+    /// Buffers that do not fit the frame's size, a device that fails, an output that is not finite.
+    pub fn denoise(&self, frame: &Frame) -> Result<Vec<f32>, DenoiseError> {
+        let padding = padding(frame)?;
+        let mut color_gamma = frame.color.clone();
+        self.meta.normalizer.color_gamma_from_hdr(&mut color_gamma);
+        let device = self.device();
+        let color_gamma = tensor::<COLOR_CHANNELS>(&color_gamma, padding, &device);
+        let out = self
+            .model
+            .forward(color_gamma, self.features_z(frame, padding));
+        let mut out = image(out, frame, padding)?;
+        // Before the way back to HDR, which would turn NaN into 0.
+        let nan = out.iter().filter(|y| y.is_nan()).count();
+        self.meta.normalizer.color_hdr_from_gamma(&mut out);
+        match nan + out.iter().filter(|x| x.is_infinite()).count() {
+            0 => Ok(out),
+            count => Err(DenoiseError::NonFinite {
+                name: frame.name.clone(),
+                count,
+            }),
+        }
+    }
+
+    /// What the fusion sub-network makes of the frame's features (Fig. 2 e), to look at; `None` for a variant
+    /// without it.
+    ///
+    /// # Shapes
+    /// Planar `[3, H, W]`, not negative, without a unit.
+    ///
+    /// # Errors
+    /// As [`denoise`](Self::denoise).
+    pub fn detail_map(&self, frame: &Frame) -> Result<Option<Vec<f32>>, DenoiseError> {
+        let padding = padding(frame)?;
+        self.model
+            .detail_map(self.features_z(frame, padding))
+            .map(|map| image(map, frame, padding))
+            .transpose()
+    }
+
+    /// Z-scored, padded features on the model's device, `[1, 12, padded H, padded W]`.
+    fn features_z(&self, frame: &Frame, padding: Padding) -> Tensor<4> {
+        let mut planes = frame.features.clone();
+        self.meta.normalizer.features_z_from_raw(&mut planes);
+        tensor::<FEATURES>(&planes, padding, &self.device())
+    }
+
+    /// Where the model is.
+    fn device(&self) -> Device {
+        let devices = self.model.devices();
+        devices.first().expect("every network has weights").clone()
+    }
+}
+
+/// The frame's padding, once its buffers are known to fit it.
+fn padding(frame: &Frame) -> Result<Padding, DenoiseError> {
+    let Frame { width, height, .. } = *frame;
+    let checks = [
+        ("color", frame.color.len(), COLOR_CHANNELS),
+        ("features", frame.features.len(), FEATURES),
+    ];
+    for (buffer, found, channels) in checks {
+        let expected = channels * width * height;
+        if found != expected || expected == 0 {
+            return Err(DenoiseError::Size {
+                name: frame.name.clone(),
+                buffer,
+                found,
+                expected,
+                width,
+                height,
+            });
+        }
+    }
+    Ok(Padding { height, width })
+}
+
+fn tensor<const CHANNELS: usize>(planes: &[f32], padding: Padding, device: &Device) -> Tensor<4> {
+    let shape = [1, CHANNELS, padding.padded_height(), padding.padded_width()];
+    Tensor::from_data(TensorData::new(padding.pad(planes), shape), device)
+}
+
+/// The network's `[1, 3, padded H, padded W]` as planar `[3, H, W]`.
+fn image(out: Tensor<4>, frame: &Frame, padding: Padding) -> Result<Vec<f32>, DenoiseError> {
+    let padded = out
+        .try_into_vec_as::<f32>()
+        .map_err(|source| DenoiseError::Device {
+            name: frame.name.clone(),
+            source,
+        })?;
+    Ok(padding.crop(&padded))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bundle::testing::{bundle, frame};
+    use demc_model::Variant;
+
+    #[test]
+    fn every_size_gives_an_image_of_its_own_size() {
+        let bundle = bundle(Variant::Demc);
+        for (width, height) in [(1, 1), (31, 33), (64, 32), (5, 70)] {
+            let out = bundle.denoise(&frame(width, height)).expect("denoised");
+            assert_eq!(out.len(), 3 * width * height);
+            assert!(out.iter().all(|x| x.is_finite() && *x >= 0.0));
+        }
+    }
+
+    #[test]
+    fn padding_equals_an_image_padded_by_hand() {
+        let bundle = bundle(Variant::Demc);
+        let small = frame(31, 33);
+        let padding = Padding {
+            height: 33,
+            width: 31,
+        };
+        let large = Frame {
+            width: 32,
+            height: 64,
+            color: padding.pad(&small.color),
+            features: padding.pad(&small.features),
+            ..small.clone()
+        };
+        let expected = padding.crop(&bundle.denoise(&large).expect("large"));
+        assert_eq!(bundle.denoise(&small).expect("small"), expected);
+    }
+
+    #[test]
+    fn two_runs_give_the_same_bits() {
+        let (bundle, frame) = (bundle(Variant::Semc), frame(40, 40));
+        let once = bundle.denoise(&frame).expect("once");
+        assert_eq!(once, bundle.denoise(&frame).expect("twice"));
+    }
+
+    #[test]
+    fn the_variant_without_fusion_has_no_detail_map() {
+        let frame = frame(33, 20);
+        let map = |variant| bundle(variant).detail_map(&frame).expect("detail map");
+        assert_eq!(map(Variant::Demc).map(|m| m.len()), Some(3 * 33 * 20));
+        assert_eq!(map(Variant::DemcNosn), None);
+    }
+
+    #[test]
+    fn buffers_that_do_not_fit_are_named() {
+        let mut frame = frame(4, 4);
+        frame.features.pop();
+        let error = bundle(Variant::Demc)
+            .denoise(&frame)
+            .expect_err("short")
+            .to_string();
+        assert!(
+            error.ends_with("features holds 191 values; 4x4 pixels need 192"),
+            "{error}"
+        );
+    }
+}

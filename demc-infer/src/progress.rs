@@ -1,0 +1,37 @@
+//! A progress bar on stderr; nothing where stderr is no terminal.
+
+use std::fmt::Display;
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+/// A bar over a list of files.
+pub struct Progress(ProgressBar);
+
+impl Progress {
+    /// A bar of `total` steps.
+    pub fn new(total: usize) -> Self {
+        let style = ProgressStyle::with_template("{bar:30} {pos}/{len}  {wide_msg}  {eta} left")
+            .expect("a constant template");
+        Self(ProgressBar::new(total as u64).with_style(style))
+    }
+
+    /// Shows what is being worked on.
+    pub fn start(&self, name: impl Display) {
+        self.0.set_message(name.to_string());
+    }
+
+    /// One step is done.
+    pub fn advance(&self) {
+        self.0.inc(1);
+    }
+
+    /// A line on stderr that the bar does not overwrite.
+    pub fn line(&self, line: impl Display) {
+        self.0.suspend(|| eprintln!("{line}"));
+    }
+
+    /// Takes the bar away.
+    pub fn finish(self) {
+        self.0.finish_and_clear();
+    }
+}

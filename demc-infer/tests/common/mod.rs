@@ -1,0 +1,112 @@
+//! What the command line tests share: a tiny random model, the sample data, and the real binary.
+#![allow(dead_code, reason = "each test file uses its part")]
+
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use burn::tensor::Device;
+use demc_data::{ChannelLayout, FeatureStats, Normalizer};
+use demc_infer::{Bundle, BundleMeta, Names, Precision};
+use demc_model::{Head, ModelConfig, Reading, Variant};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+use tempfile::TempDir;
+
+/// A directory with `best.safetensors`, as a run leaves it: a random network of base width 2.
+pub fn run_directory() -> TempDir {
+    let directory = tempfile::tempdir().expect("directory");
+    let path = directory.path().join("best.safetensors");
+    random_bundle()
+        .save(&path, Names::Burn, Precision::F32)
+        .expect("saved");
+    directory
+}
+
+/// A random network in the released reading, with batch normalisation in the decoder.
+pub fn random_bundle() -> Bundle {
+    let model = ModelConfig {
+        variant: Variant::Demc,
+        reading: Reading::Released,
+        width: 2,
+        head: Head::Grey,
+    };
+    let normalizer = Normalizer {
+        gamma: 2.2,
+        features: FeatureStats {
+            mean: [0.2; 12],
+            std: [0.7; 12],
+        },
+        flat_color: [0.4, 0.3, 0.2],
+    };
+    let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    Bundle {
+        model: model.init(&mut rng, normalizer.flat_color, &Device::flex()),
+        meta: BundleMeta::new(model, normalizer, layout, 500),
+    }
+}
+
+/// The repository's sample data set.
+pub fn sample() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../data/sample")
+}
+
+/// A test image of the sample.
+pub fn sample_image(name: &str) -> PathBuf {
+    sample().join("test").join(name)
+}
+
+/// What a run of `demc-infer` gave.
+pub struct Outcome {
+    pub code: i32,
+    pub stdout: String,
+    pub stderr: String,
+}
+
+/// Runs `demc-infer` with these arguments.
+pub fn demc_infer<A: AsRef<OsStr>>(arguments: impl IntoIterator<Item = A>) -> Outcome {
+    let Output {
+        status,
+        stdout,
+        stderr,
+    } = Command::new(env!("CARGO_BIN_EXE_demc-infer"))
+        .args(arguments)
+        .output()
+        .expect("started");
+    Outcome {
+        code: status.code().expect("not killed"),
+        stdout: String::from_utf8(stdout).expect("UTF-8"),
+        stderr: String::from_utf8(stderr).expect("UTF-8"),
+    }
+}
+
+/// Arguments of different types as one list.
+#[macro_export]
+macro_rules! arguments {
+    ($($argument:expr),* $(,)?) => {
+        [$(std::ffi::OsString::from(&$argument)),*]
+    };
+}
+
+impl Outcome {
+    /// Fails the test unless the exit code is 0.
+    pub fn success(self) -> Self {
+        assert_eq!(self.code, 0, "{}", self.stderr);
+        self
+    }
+
+    /// Fails the test unless the run ended with `code` and stderr is one line: `error: ` and `start`...
+    pub fn failure(self, code: i32, start: &str) -> Self {
+        assert_eq!(self.code, code, "{}", self.stderr);
+        assert_eq!(self.stderr.lines().count(), 1, "{}", self.stderr);
+        let expected = format!("error: {start}");
+        assert!(
+            self.stderr.starts_with(&expected),
+            "{:?} is not the start of {:?}",
+            expected,
+            self.stderr
+        );
+        self
+    }
+}

@@ -1,0 +1,337 @@
+//! The configuration of a run: one TOML file with the tables `[model]`, `[data]`, `[train]` and `[run]`.
+//!
+//! Strict: an unknown key, a wrong type or a value out of range stops the run before it starts, and every problem is
+//! named at once. `--set table.key=value` edits the file's tree before it is parsed. Paths are relative to the current
+//! directory; the resolved configuration, saved with the run, holds absolute ones.
+
+mod source;
+
+use std::path::{Path, PathBuf};
+
+use demc_data::DataConfig;
+use demc_model::ModelConfig;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use crate::schedule::{Decay, LearningRate};
+
+/// Iterations (Sec. 4.2: "approximately 250K").
+const STEPS: u64 = 250_000;
+/// First learning rate (Sec. 4.2).
+const LR_START: f64 = 1e-4;
+/// Last learning rate (Sec. 4.2).
+const LR_END: f64 = 5e-6;
+/// Adam's epsilon (Kingma and Ba 2014).
+const ADAM_EPSILON: f32 = 1e-8;
+/// Ours: 1 in 50 of a run of some hundred steps, and no load on a long one.
+const LOG_EVERY: u64 = 50;
+/// Ours: about one epoch of the paper's run.
+const VALIDATE_EVERY: u64 = 1000;
+/// Ours: a stopped run loses at most as much as between two validations.
+const CHECKPOINT_EVERY: u64 = 1000;
+/// Ours: the last one may be the one that was being written.
+const KEEP: usize = 2;
+
+/// Everything that decides a run.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// The network.
+    pub model: ModelConfig,
+    /// The data set and how patches are cut.
+    pub data: DataConfig,
+    /// The optimisation.
+    pub train: TrainConfig,
+    /// Where and how often the run is recorded.
+    pub run: RunConfig,
+}
+
+/// The `[train]` table.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainConfig {
+    /// Optimizer steps of the whole run.
+    pub steps: u64,
+    /// Learning rate of the first step.
+    pub lr_start: f64,
+    /// Learning rate towards which the run goes.
+    pub lr_end: f64,
+    /// The way from the one to the other.
+    pub decay: Decay,
+    /// Adam's epsilon.
+    pub adam_epsilon: f32,
+    /// Epsilon of the loss (Eq. 5).
+    pub loss_epsilon: f32,
+    /// Batches whose gradients are averaged in one step: a step sees `data.batch_size * grad_accumulation` patches.
+    pub grad_accumulation: usize,
+    /// Largest norm of the whole gradient; a longer one is shortened to it. 0: no limit, as in the paper.
+    pub grad_clip: f32,
+    /// Seed of weights, validation scenes, shuffling and augmentation.
+    pub seed: u64,
+}
+
+impl Default for TrainConfig {
+    /// The paper's optimisation (Sec. 4.2).
+    fn default() -> Self {
+        TrainConfig {
+            steps: STEPS,
+            lr_start: LR_START,
+            lr_end: LR_END,
+            decay: Decay::Exponential,
+            adam_epsilon: ADAM_EPSILON,
+            loss_epsilon: demc_model::metrics::LOSS_EPSILON,
+            grad_accumulation: 1,
+            grad_clip: 0.0,
+            seed: 1,
+        }
+    }
+}
+
+/// The `[run]` table.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RunConfig {
+    /// Run directory; empty: `runs/` and the configuration file's name.
+    pub dir: PathBuf,
+    /// Steps between two lines of `metrics.jsonl`.
+    pub log_every: u64,
+    /// Steps between two validations.
+    pub validate_every: u64,
+    /// Steps between two checkpoints.
+    pub checkpoint_every: u64,
+    /// How many of the newest checkpoints stay; the best weights of validation stay beside them.
+    pub keep: usize,
+}
+
+impl Default for RunConfig {
+    fn default() -> Self {
+        RunConfig {
+            dir: PathBuf::new(),
+            log_every: LOG_EVERY,
+            validate_every: VALIDATE_EVERY,
+            checkpoint_every: CHECKPOINT_EVERY,
+            keep: KEEP,
+        }
+    }
+}
+
+/// Why a configuration cannot be used.
+#[derive(Debug, Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("{}: {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// The file is not TOML, holds unknown keys, or a value has the wrong type.
+    #[error("{0}")]
+    Source(String),
+    /// Values out of range, all of them.
+    #[error("{}: {}", path.display(), problems.join("; "))]
+    Values {
+        /// The file.
+        path: PathBuf,
+        /// One line each.
+        problems: Vec<String>,
+    },
+}
+
+impl Config {
+    /// Reads, edits and checks a configuration; the result has absolute paths.
+    ///
+    /// `sets` are the edits, `table.key=value`, the value in TOML's notation or a bare string.
+    ///
+    /// # Errors
+    /// See [`ConfigError`]; every unknown key and every value out of range is named.
+    pub fn load(path: &Path, sets: &[String]) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read {
+            path: path.into(),
+            source,
+        })?;
+        let mut config = source::parse(path, &text, sets).map_err(ConfigError::Source)?;
+        let problems = config.validate();
+        if !problems.is_empty() {
+            return Err(ConfigError::Values {
+                path: path.into(),
+                problems,
+            });
+        }
+        if config.run.dir.as_os_str().is_empty() {
+            config.run.dir = Path::new("runs").join(path.file_stem().unwrap_or_default());
+        }
+        config.make_absolute().map_err(|source| ConfigError::Read {
+            path: path.into(),
+            source,
+        })?;
+        Ok(config)
+    }
+
+    fn make_absolute(&mut self) -> std::io::Result<()> {
+        self.data.root = std::path::absolute(&self.data.root)?;
+        self.run.dir = std::path::absolute(&self.run.dir)?;
+        if self.data.layout.ends_with(".toml") {
+            let layout = std::path::absolute(&self.data.layout)?;
+            self.data.layout = layout.to_string_lossy().into_owned();
+        }
+        Ok(())
+    }
+
+    /// Every value out of range, one line each.
+    pub fn validate(&self) -> Vec<String> {
+        let (train, run) = (&self.train, &self.run);
+        let positive = |value: f64| value.is_finite() && value > 0.0;
+        let checks = [
+            (train.steps > 0, "train.steps: at least 1"),
+            (
+                positive(train.lr_start),
+                "train.lr_start: a positive number",
+            ),
+            (positive(train.lr_end), "train.lr_end: a positive number"),
+            (
+                positive(train.adam_epsilon.into()),
+                "train.adam_epsilon: a positive number",
+            ),
+            (
+                positive(train.loss_epsilon.into()),
+                "train.loss_epsilon: a positive number",
+            ),
+            (
+                train.grad_accumulation > 0,
+                "train.grad_accumulation: at least 1",
+            ),
+            (
+                train.grad_clip.is_finite() && train.grad_clip >= 0.0,
+                "train.grad_clip: 0 (off) or a positive number",
+            ),
+            (
+                train.seed <= i64::MAX as u64,
+                "train.seed: at most 9223372036854775807, TOML's largest integer",
+            ),
+            (run.log_every > 0, "run.log_every: at least 1"),
+            (run.validate_every > 0, "run.validate_every: at least 1"),
+            (run.checkpoint_every > 0, "run.checkpoint_every: at least 1"),
+            (run.keep > 0, "run.keep: at least 1"),
+        ];
+        let ours = checks
+            .into_iter()
+            .filter(|(holds, _)| !holds)
+            .map(|(_, problem)| problem.to_string());
+        self.model
+            .validate()
+            .into_iter()
+            .chain(self.data.validate())
+            .chain(ours)
+            .collect()
+    }
+
+    /// The configuration as TOML.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("a configuration is plain data")
+    }
+
+    /// The learning rate of this run.
+    pub fn learning_rate(&self) -> LearningRate {
+        let TrainConfig {
+            steps,
+            lr_start,
+            lr_end,
+            decay,
+            ..
+        } = self.train;
+        LearningRate {
+            start: lr_start,
+            end: lr_end,
+            decay,
+            steps,
+        }
+    }
+
+    /// Patches that one step sees.
+    pub fn patches_per_step(&self) -> u64 {
+        (self.data.batch_size * self.train.grad_accumulation) as u64
+    }
+
+    /// The keys by which a run of `self` would differ from one of `other`; empty if one may continue the other.
+    ///
+    /// Where the run is kept, how many checkpoints stay, and threads and memory of the loader change no number.
+    pub fn differences(&self, other: &Config) -> Vec<String> {
+        let essence = |config: &Config| {
+            let mut config = config.clone();
+            config.run.dir = PathBuf::new();
+            config.run.keep = KEEP;
+            config.data.workers = DataConfig::default().workers;
+            config.data.cache_mib = DataConfig::default().cache_mib;
+            source::leaves(&config)
+        };
+        let (ours, theirs) = (essence(self), essence(other));
+        let changed = ours
+            .iter()
+            .filter(|(key, value)| theirs.get(*key) != Some(*value));
+        changed
+            .map(|(key, value)| {
+                let there = theirs
+                    .get(key)
+                    .map_or("nothing".to_string(), ToString::to_string);
+                format!("{key} = {value}, there {there}")
+            })
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defaults_are_the_papers_and_valid() {
+        let config = Config::default();
+        assert!(config.validate().is_empty());
+        assert_eq!(
+            (
+                config.model.width,
+                config.data.batch_size,
+                config.train.steps
+            ),
+            (64, 64, 250_000)
+        );
+        assert_eq!(config.train.grad_clip, 0.0);
+    }
+
+    #[test]
+    fn all_values_out_of_range_are_named_at_once() {
+        let mut config = Config::default();
+        config.model.width = 0;
+        config.data.stride = 0;
+        config.train.lr_start = f64::NAN;
+        config.run.keep = 0;
+        let problems = config.validate();
+        for key in ["model.width", "data.stride", "train.lr_start", "run.keep"] {
+            assert!(
+                problems.iter().any(|p| p.starts_with(key)),
+                "{key}: {problems:?}"
+            );
+        }
+        assert_eq!(problems.len(), 4);
+    }
+
+    #[test]
+    fn resolved_configuration_is_one_itself() {
+        let mut config = Config::default();
+        config.train.lr_start = 3e-3;
+        assert_eq!(toml::from_str::<Config>(&config.to_toml()).unwrap(), config);
+    }
+
+    #[test]
+    fn only_what_changes_numbers_makes_another_run() {
+        let config = Config::default();
+        let mut moved = config.clone();
+        moved.run.dir = "elsewhere".into();
+        moved.data.workers = 2;
+        assert!(moved.differences(&config).is_empty());
+        moved.train.seed = 9;
+        assert_eq!(moved.differences(&config), ["train.seed = 9, there 1"]);
+    }
+}

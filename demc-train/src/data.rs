@@ -1,0 +1,55 @@
+//! The data of a run: the scenes of each split and the statistics of those that are trained on.
+
+use anyhow::Context;
+use demc_data::{ChannelLayout, DataConfig, Dataset, Normalizer, Scene, Split, Statistics};
+
+/// A data set, opened, split and measured.
+#[derive(Debug)]
+pub struct Data {
+    /// What is in the files.
+    pub layout: ChannelLayout,
+    /// Scenes that are trained on.
+    pub train: Vec<Scene>,
+    /// Scenes of the training split that are held out by base scene; may be empty.
+    pub validation: Vec<Scene>,
+    /// The test split; may be empty.
+    pub test: Vec<Scene>,
+    /// Gamma and the statistics of [`Self::train`].
+    pub normalizer: Normalizer,
+    /// Negative values of colour and reference that count as 0.
+    pub clamped: u64,
+}
+
+impl Data {
+    /// Opens the data set that `config` names; `seed` draws the validation scenes.
+    ///
+    /// # Errors
+    /// A layout, manifest or image that cannot be used, or a training split without scenes.
+    pub fn open(config: &DataConfig, seed: u64) -> anyhow::Result<Self> {
+        let layout = ChannelLayout::resolve(&config.layout)?;
+        let dataset = Dataset::open(&config.root, &layout)?;
+        let (train, validation) = dataset.train_validation(config.validation, seed)?;
+        let test = dataset
+            .scenes
+            .iter()
+            .filter(|scene| scene.split == Split::Test)
+            .cloned()
+            .collect();
+        let statistics = Statistics::measure(&train, &layout, config.gamma)
+            .context("measuring the training scenes")?;
+        Ok(Data {
+            layout,
+            train,
+            validation,
+            test,
+            normalizer: statistics.normalizer,
+            clamped: statistics.clamped,
+        })
+    }
+
+    /// `10 training scenes, 2 for validation, 4 for testing`.
+    pub fn summary(&self) -> String {
+        let [train, validation, test] = [&self.train, &self.validation, &self.test].map(Vec::len);
+        format!("{train} scenes to train on, {validation} to validate, {test} to test")
+    }
+}

@@ -1,0 +1,108 @@
+//! How long a run will take, from one patch that is trained on and thrown away.
+
+use std::convert::Infallible;
+use std::fmt;
+use std::time::{Duration, Instant};
+
+use burn::tensor::Device;
+use demc_data::{Batch, FEATURES};
+
+use crate::config::Config;
+use crate::data::Data;
+use crate::optimizer::Adam;
+use crate::trainer::{Trainer, initial_model};
+
+/// A forward pass as a share of forward, backward and optimizer; ours, measured between 0.2 and 0.4.
+const FORWARD_SHARE: f64 = 0.3;
+
+/// A run's duration, roughly.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Estimate {
+    /// One step.
+    pub step: Duration,
+    /// One validation.
+    pub validation: Duration,
+    /// The steps and validations that are left.
+    pub left: Duration,
+}
+
+impl Estimate {
+    /// Trains a network like that of `config` on one patch, twice, and scales the faster time to the steps after `first`.
+    pub fn measure(config: &Config, data: &Data, first: u64, device: &Device) -> Self {
+        let mut single = config.clone();
+        single.train.grad_accumulation = 1;
+        let model = initial_model(&config.model, 0, data.normalizer.flat_color, device);
+        let mut trainer = Trainer::new(&single, model, Adam::new(1e-8), device.clone());
+        let patch = grey_patch(config.data.patch_size);
+        let mut time = || {
+            let started = Instant::now();
+            let Ok(_) = trainer.step(0.0, || Ok::<_, Infallible>(patch.clone()));
+            started.elapsed()
+        };
+        let patch_time = time().min(time());
+        let pixels: usize = data
+            .validation
+            .iter()
+            .map(|scene| scene.width * scene.height)
+            .sum();
+        let patches = pixels as f64 / (config.data.patch_size * config.data.patch_size) as f64;
+        let step = patch_time.mul_f64(config.patches_per_step() as f64);
+        let validation = patch_time.mul_f64(patches * FORWARD_SHARE);
+        let steps = config.train.steps.saturating_sub(first);
+        let validations = steps as f64 / config.run.validate_every as f64;
+        let left = step.mul_f64(steps as f64) + validation.mul_f64(validations);
+        Estimate {
+            step,
+            validation,
+            left,
+        }
+    }
+}
+
+fn grey_patch(side: usize) -> Batch {
+    let planes = |channels: usize| vec![0.5; channels * side * side];
+    Batch {
+        size: 1,
+        color_gamma: planes(3),
+        features_z: planes(FEATURES),
+        reference_hdr: planes(3),
+        patches: Vec::new(),
+    }
+}
+
+impl fmt::Display for Estimate {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "about {} ({} a step)",
+            human(self.left),
+            human(self.step)
+        )
+    }
+}
+
+/// `3 days 4 h`, `2 h 5 min`, `3 min 20 s`, `4.2 s`: two units at most.
+fn human(duration: Duration) -> String {
+    let seconds = duration.as_secs();
+    let (days, hours, minutes) = (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60);
+    match (days, hours, minutes) {
+        (0, 0, 0) => format!("{:.1} s", duration.as_secs_f64()),
+        (0, 0, _) => format!("{minutes} min {} s", seconds % 60),
+        (0, _, _) => format!("{hours} h {minutes} min"),
+        _ => format!("{days} days {hours} h"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn durations_have_two_units_at_most() {
+        let human = |seconds| human(Duration::from_secs_f64(seconds));
+        assert_eq!(human(4.24), "4.2 s");
+        assert_eq!(human(200.0), "3 min 20 s");
+        assert_eq!(human(7500.0), "2 h 5 min");
+        assert_eq!(human(273_700.0), "3 days 4 h");
+    }
+}

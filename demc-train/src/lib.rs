@@ -1,0 +1,20 @@
+//! Trains the networks of `demc-model` on the scenes of `demc-data`.
+//!
+//! The way of a run, in the order of the modules: [`config`] reads and checks a TOML file, [`data`] opens the data set
+//! and measures its statistics, [`trainer`] steps (loss of Eq. 5, [`optimizer`], [`schedule`]), [`validation`] scores
+//! held-out scenes with the code that ships, [`checkpoint`] and [`run_dir`] keep what a resumed run needs to go on bit
+//! for bit. [`train`] is the loop that ties them together.
+
+pub mod checkpoint;
+pub mod config;
+pub mod data;
+pub mod estimate;
+pub mod optimizer;
+pub mod progress;
+pub mod run_dir;
+pub mod schedule;
+pub mod train;
+pub mod trainer;
+pub mod validation;
+
+pub use config::Config;

@@ -1,0 +1,300 @@
+//! Adam (Kingma and Ba 2014) and what happens to a gradient before it: its norm, and clipping to one.
+//!
+//! The arithmetic of a step is Burn's own; its state is kept here, by the names of the weights, because Burn's
+//! whole-module optimizer restores state on a default device that may not exist on the machine at hand.
+
+use std::collections::BTreeMap;
+
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::optim::{AdamConfig, AdamState, AdaptiveMomentumState, GradientsParams, Optimizer};
+use burn::tensor::{Device, Tensor, TensorData};
+use demc_model::{Denoiser, Weight};
+
+/// Decay of the first moment (the defaults of Kingma and Ba, which the paper does not change).
+const BETA_1: f32 = 0.9;
+/// Decay of the second moment.
+const BETA_2: f32 = 0.999;
+/// Suffix of the first moment's name in a checkpoint.
+const FIRST: &str = ".m";
+/// Suffix of the second moment's name.
+const SECOND: &str = ".v";
+
+/// Adam over a network's trainable weights.
+pub struct Adam {
+    rule: burn::optim::Adam,
+    steps: u64,
+    moments: BTreeMap<String, Moments>,
+}
+
+/// The moments of one weight, flattened.
+#[derive(Clone)]
+struct Moments {
+    first: Tensor<1>,
+    second: Tensor<1>,
+}
+
+impl Adam {
+    /// A fresh optimizer.
+    pub fn new(epsilon: f32) -> Self {
+        let rule = AdamConfig::new()
+            .with_beta_1(BETA_1)
+            .with_beta_2(BETA_2)
+            .with_epsilon(epsilon)
+            .build();
+        Adam {
+            rule,
+            steps: 0,
+            moments: BTreeMap::new(),
+        }
+    }
+
+    /// Steps taken so far.
+    pub fn steps(&self) -> u64 {
+        self.steps
+    }
+
+    /// The network after one step along `grads` at learning rate `lr`.
+    pub fn step(&mut self, lr: f64, model: Denoiser, grads: GradientsParams) -> Denoiser {
+        let mut mapper = Step {
+            adam: self,
+            lr,
+            grads,
+            path: Vec::new(),
+        };
+        let model = model.map(&mut mapper);
+        self.steps += 1;
+        model
+    }
+
+    /// The state on the host: two tensors a weight, by name.
+    pub fn state(&self) -> Vec<Weight> {
+        let moments = self.moments.iter().flat_map(|(name, moments)| {
+            [(FIRST, &moments.first), (SECOND, &moments.second)].map(|(suffix, tensor)| {
+                let data = tensor
+                    .to_data()
+                    .try_to_vec::<f32>()
+                    .expect("moments are float32");
+                Weight {
+                    name: format!("{name}{suffix}"),
+                    shape: vec![data.len()],
+                    data,
+                }
+            })
+        });
+        moments.collect()
+    }
+
+    /// The optimizer that [`Self::state`] describes after `steps` steps; the name of a moment whose partner is missing
+    /// as the error.
+    pub fn restore(
+        epsilon: f32,
+        steps: u64,
+        state: Vec<Weight>,
+        device: &Device,
+    ) -> Result<Self, String> {
+        let mut tensors: BTreeMap<String, Tensor<1>> = state
+            .into_iter()
+            .map(|weight| {
+                let data = TensorData::new(weight.data, weight.shape);
+                (weight.name, Tensor::from_data(data, device))
+            })
+            .collect();
+        let mut adam = Adam {
+            steps,
+            ..Adam::new(epsilon)
+        };
+        while let Some((name, tensor)) = tensors.pop_first() {
+            let weight = name.strip_suffix(FIRST).ok_or_else(|| name.clone())?;
+            let second = tensors
+                .remove(&format!("{weight}{SECOND}"))
+                .ok_or_else(|| name.clone())?;
+            adam.moments.insert(
+                weight.to_string(),
+                Moments {
+                    first: tensor,
+                    second,
+                },
+            );
+        }
+        Ok(adam)
+    }
+}
+
+/// One step over all weights of a network.
+struct Step<'a> {
+    adam: &'a mut Adam,
+    lr: f64,
+    grads: GradientsParams,
+    path: Vec<String>,
+}
+
+impl ModuleMapper for Step<'_> {
+    fn enter_module(&mut self, name: &str, _container_type: &str) {
+        self.path.push(name.to_string());
+    }
+
+    fn exit_module(&mut self, _name: &str, _container_type: &str) {
+        self.path.pop();
+    }
+
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let (id, tensor, mapper) = param.consume();
+        let Some(grad) = self.grads.remove::<D>(id) else {
+            return Param::from_mapped_value(id, tensor, mapper);
+        };
+        let name = self.path.join(".");
+        let shape = tensor.dims();
+        let state = self.adam.moments.remove(&name).map(|moments| {
+            let time = usize::try_from(self.adam.steps).expect("fewer steps than addresses");
+            AdamState::new(AdaptiveMomentumState::new(
+                time,
+                moments.first,
+                moments.second,
+            ))
+        });
+        let flat = tensor.inner().reshape([-1]);
+        let (stepped, state) = self
+            .adam
+            .rule
+            .step::<1>(self.lr, flat, grad.reshape([-1]), state);
+        let AdaptiveMomentumState {
+            moment_1, moment_2, ..
+        } = state.expect("Adam always has a state").momentum;
+        self.adam.moments.insert(
+            name,
+            Moments {
+                first: moment_1,
+                second: moment_2,
+            },
+        );
+        let tensor = Tensor::from_inner(stepped.reshape(shape)).require_grad();
+        Param::from_mapped_value(id, tensor, mapper)
+    }
+}
+
+/// The Euclidean norm of the whole gradient.
+pub fn grad_norm(model: &Denoiser, grads: &GradientsParams) -> f64 {
+    struct Squares<'a> {
+        grads: &'a GradientsParams,
+        sums: Vec<Tensor<1>>,
+    }
+    impl ModuleVisitor for Squares<'_> {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            if let Some(grad) = self.grads.get::<D>(param.id) {
+                self.sums.push(grad.square().sum());
+            }
+        }
+    }
+    let mut squares = Squares {
+        grads,
+        sums: Vec::new(),
+    };
+    model.visit(&mut squares);
+    // One transfer for all tensors; the sum of the sums in float64, on the host.
+    let sums = Tensor::cat(squares.sums, 0)
+        .into_data()
+        .try_to_vec::<f32>()
+        .expect("gradients are float32");
+    sums.into_iter().map(f64::from).sum::<f64>().sqrt()
+}
+
+/// The gradient times `factor`.
+pub fn scaled(model: &Denoiser, grads: GradientsParams, factor: f64) -> GradientsParams {
+    struct Scale {
+        grads: GradientsParams,
+        factor: f64,
+    }
+    impl ModuleVisitor for Scale {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            if let Some(grad) = self.grads.remove::<D>(param.id) {
+                self.grads.register(param.id, grad.mul_scalar(self.factor));
+            }
+        }
+    }
+    let mut scale = Scale { grads, factor };
+    model.visit(&mut scale);
+    scale.grads
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::optim::GradientsParams;
+    use demc_model::ModelConfig;
+    use rand::SeedableRng;
+
+    fn model(device: &Device) -> Denoiser {
+        let config = ModelConfig {
+            width: 1,
+            ..ModelConfig::default()
+        };
+        config.init(
+            &mut rand_chacha::ChaCha8Rng::seed_from_u64(3),
+            [0.3; 3],
+            device,
+        )
+    }
+
+    fn gradient(model: &Denoiser, device: &Device) -> GradientsParams {
+        let image = |channels| Tensor::<4>::full([1, channels, 32, 32], 0.7, device);
+        GradientsParams::from_grads(
+            model.forward(image(3), image(12)).square().sum().backward(),
+            model,
+        )
+    }
+
+    /// The whole-module optimizer of Burn is the oracle.
+    #[test]
+    fn steps_are_burns_own_bit_for_bit() {
+        let device = Device::flex().autodiff();
+        let mut theirs = model(&device);
+        let mut ours = model(&device);
+        let mut oracle = AdamConfig::new().with_epsilon(1e-8).init();
+        let mut adam = Adam::new(1e-8);
+        for _ in 0..3 {
+            let grads = gradient(&theirs, &device);
+            theirs = oracle.step(1e-3, theirs, grads);
+            let grads = gradient(&ours, &device);
+            ours = adam.step(1e-3, ours, grads);
+        }
+        assert_ne!(ours.weights(), model(&device).weights());
+        assert_eq!(ours.weights(), theirs.weights());
+    }
+
+    #[test]
+    fn restored_optimizer_goes_on_bit_for_bit() {
+        let device = Device::flex().autodiff();
+        let mut adam = Adam::new(1e-8);
+        let first = model(&device);
+        let grads = gradient(&first, &device);
+        let first = adam.step(1e-3, first, grads);
+        let mut again = Adam::restore(1e-8, adam.steps(), adam.state(), &Device::flex()).unwrap();
+        let grads = || gradient(&first, &device);
+        let a = adam.step(1e-3, first.clone(), grads()).weights();
+        let b = again.step(1e-3, first.clone(), grads()).weights();
+        assert_eq!(a, b);
+    }
+
+    #[test]
+    fn a_lost_moment_is_named() {
+        let state = vec![Weight {
+            name: "head.m".into(),
+            shape: vec![1],
+            data: vec![0.0],
+        }];
+        assert_eq!(
+            Adam::restore(1e-8, 1, state, &Device::flex()).err(),
+            Some("head.m".to_string())
+        );
+    }
+
+    #[test]
+    fn scaling_scales_the_norm() {
+        let device = Device::flex().autodiff();
+        let model = model(&device);
+        let grads = gradient(&model, &device);
+        let norm = grad_norm(&model, &grads);
+        let halved = grad_norm(&model, &scaled(&model, grads, 0.5));
+        assert!(norm > 0.0 && (halved / norm - 0.5).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,108 @@
+"""Exported weights: one safetensors file that `demc-infer export` wrote, and what is needed to denoise with it.
+
+The header's key ``demc`` holds JSON: the model's configuration, the normalisation statistics of the training set, the
+names of the renderer's channels and the training step.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+from torch.nn import functional as F
+
+from .metrics import gamma_from_hdr, hdr_from_gamma
+from .network import FEATURES, SIZE_MULTIPLE, Denoiser, ModelConfig
+
+FORMAT = 1
+"""The bundle format that this package reads."""
+TORCH_FROM_BURN = {"gamma": "weight", "beta": "bias"}
+"""What differs between the two sets of names: the last part of a batch normalisation's keys."""
+
+
+@dataclass
+class Bundle:
+    """A network in eval mode with the normalisation it was trained with."""
+
+    model: Denoiser
+    gamma: float
+    feature_mean: Tensor  # [12]
+    feature_std: Tensor  # [12]
+    step: int
+    meta: dict  # the whole header, for those who need more
+
+    def features_z_from_raw(self, features: Tensor) -> Tensor:
+        """[B, 12, H, W] features as rendered -> Z-scored."""
+        shape = (1, FEATURES, 1, 1)
+        return (features - self.feature_mean.view(shape)) / self.feature_std.view(shape)
+
+    @torch.inference_mode()
+    def denoise(self, color_hdr: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """Denoises one image of any size; padded by edge replication to a multiple of 32 and cropped back.
+
+        `color_hdr` is [3, H, W] linear radiance and `features` [12, H, W] as rendered, in the order normal, position,
+        first texture, second texture. Returns [3, H, W] linear radiance, float32.
+        """
+        height, width = color_hdr.shape[-2:]
+        for what, array, channels in (("color_hdr", color_hdr, 3), ("features", features, FEATURES)):
+            if array.shape != (channels, height, width):
+                raise ValueError(f"{what} is {list(array.shape)}: expected [{channels}, {height}, {width}]")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{what} holds NaN or infinite values")
+        device = next(self.model.parameters()).device
+        color, feats = (torch.from_numpy(np.float32(a)).to(device)[None] for a in (color_hdr, features))
+        pad = (0, -width % SIZE_MULTIPLE, 0, -height % SIZE_MULTIPLE)
+        color_gamma = F.pad(gamma_from_hdr(color, self.gamma), pad, mode="replicate")
+        features_z = F.pad(self.features_z_from_raw(feats), pad, mode="replicate")
+        out = self.model(color_gamma, features_z)[0, :, :height, :width]
+        return hdr_from_gamma(out, self.gamma).cpu().numpy()
+
+    def to(self, device: torch.device | str) -> Bundle:
+        """Moves the network and the statistics to `device`, in place."""
+        self.model.to(device)
+        self.feature_mean, self.feature_std = self.feature_mean.to(device), self.feature_std.to(device)
+        return self
+
+
+def load(path: str | os.PathLike) -> Bundle:
+    """Reads a bundle with either set of names, in f32 or f16 (which becomes f32). Every tensor must be there and fit.
+
+    Raises OSError where the file cannot be read and ValueError where it is no bundle of this format or its weights are
+    not those of the network that its header describes.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = (file.metadata() or {}).get("demc")
+            weights = {torch_name_from(name): file.get_tensor(name).float() for name in file.keys()}
+    except SafetensorError as error:
+        raise ValueError(f"{path}: cut short, damaged or no safetensors file: {error}") from error
+    if header is None:
+        raise ValueError(f"{path}: no key 'demc' in the header: not a file that demc-infer exported")
+    meta = json.loads(header)
+    if meta["format"] != FORMAT:
+        raise ValueError(f"{path}: bundle format {meta['format']}: this package reads format {FORMAT}")
+    model = Denoiser(ModelConfig(**meta["model"]))
+    try:
+        model.load_state_dict(weights, strict=True)
+    except RuntimeError as error:
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
+    normalizer = meta["normalizer"]
+    return Bundle(
+        model=model.eval(),
+        gamma=normalizer["gamma"],
+        feature_mean=torch.tensor(normalizer["features"]["mean"]),
+        feature_std=torch.tensor(normalizer["features"]["std"]),
+        step=meta["step"],
+        meta=meta,
+    )
+
+
+def torch_name_from(name: str) -> str:
+    """The PyTorch name of a weight, whichever of the two sets of names `name` comes from."""
+    head, _, last = name.rpartition(".")
+    return f"{head}.{TORCH_FROM_BURN.get(last, last)}"

@@ -1,0 +1,280 @@
+"""DEMC, DEMCnoSN and SEMC as PyTorch modules, in both readings of the paper.
+
+Everything is NCHW. Level i = 1..5 of an encoder has ``width * (1, 2, 4, 8, 8)`` channels at 1, 1/2, 1/4, 1/8 and 1/16
+of the input's resolution; the latent sits at 1/32, so heights and widths must be multiples of 32. Attribute names are
+the keys of the weight files: renaming one breaks them. Section, equation and figure numbers are the paper's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+FEATURES = 12
+"""Feature channels: normal xyz, world position xyz, texture RGB at the 1st and at the 2nd intersection (Sec. 3.1)."""
+SIZE_MULTIPLE = 32
+"""Heights and widths must be multiples of this: five max-pools of 2."""
+LEVEL_FACTORS = (1, 2, 4, 8, 8)
+"""Channels of the encoder levels, in units of the base width (Fig. 3)."""
+BN_EPSILON = 1e-3
+"""TensorFlow's default, which the authors' code uses."""
+BN_MOMENTUM = 0.01
+"""Share of the new batch in the running statistics: TensorFlow's momentum 0.99."""
+GREY_HEAD_SCALE = 0.1
+"""What a grey head multiplies its Xavier weights by (ours)."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """With or without the fusion sub-network, and what each encoder eats. The last encoder feeds the latent."""
+
+    fusion: bool
+    encoders: tuple[tuple[str, ...], ...]
+
+
+VARIANTS = {
+    "demc": Variant(fusion=True, encoders=(("detail",), ("color",))),
+    "demc-nosn": Variant(fusion=False, encoders=(("features",), ("color",))),  # Sec. 4.3
+    "semc": Variant(fusion=True, encoders=(("detail", "color"),)),  # Sec. 4.4, Fig. 4
+}
+CHANNELS = {"detail": 3, "color": 3, "features": FEATURES}
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What the paper's text and the authors' published model do differently."""
+
+    convs: tuple[int, ...]  # convolutions of each encoder level
+    skip_after: tuple[int, ...]  # the skip is taken after this many of them
+    norm: bool  # BatchNorm in the latent and after each deconvolution
+    fuse_relu: bool  # ReLU after the 1x1 skip fusion
+
+
+READINGS = {
+    "paper": Reading(convs=(3, 3, 3, 3, 3), skip_after=(2, 2, 2, 2, 2), norm=False, fuse_relu=True),
+    "released": Reading(convs=(2, 2, 3, 3, 3), skip_after=(2, 2, 3, 3, 3), norm=True, fuse_relu=False),
+}
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The `model` part of a bundle's metadata. `head` says only how training started: it changes no computation."""
+
+    variant: str = "demc"
+    reading: str = "paper"
+    width: int = 64
+    head: str = "grey"
+
+    def __post_init__(self) -> None:
+        for what, value, known in (
+            ("variant", self.variant, VARIANTS),
+            ("reading", self.reading, READINGS),
+            ("head", self.head, ("grey", "xavier")),
+        ):
+            if value not in known:
+                raise ValueError(f"unknown {what} {value!r}: expected one of {', '.join(known)}")
+        if self.width < 1:
+            raise ValueError(f"width is {self.width}: expected at least 1")
+
+
+class BatchNorm(nn.Module):
+    """Batch normalisation with the conventions of the Rust side.
+
+    Unlike ``nn.BatchNorm2d``, the running variance takes in the *biased* batch variance (as Burn 0.22 and TensorFlow's
+    non-fused operation do; PyTorch and TensorFlow's fused one multiply it by N/(N-1)), and there is no
+    ``num_batches_tracked``.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
+        self.register_buffer("running_mean", torch.zeros(channels))
+        self.register_buffer("running_var", torch.ones(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not self.training:
+            return F.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, eps=BN_EPSILON)
+        with torch.no_grad():
+            self.running_mean.lerp_(x.mean((0, 2, 3)), BN_MOMENTUM)
+            self.running_var.lerp_(x.var((0, 2, 3), correction=0), BN_MOMENTUM)
+        return F.batch_norm(x, None, None, self.weight, self.bias, training=True, eps=BN_EPSILON)
+
+
+def conv3x3(in_channels: int, out_channels: int) -> nn.Conv2d:
+    """A 3x3 convolution that keeps the size."""
+    return nn.Conv2d(in_channels, out_channels, 3, padding=1)
+
+
+class FusionBlock(nn.Module):
+    """conv3x3, BatchNorm where `norm`, ReLU."""
+
+    def __init__(self, in_channels: int, out_channels: int, norm: bool) -> None:
+        super().__init__()
+        self.conv = conv3x3(in_channels, out_channels)
+        self.norm = BatchNorm(out_channels) if norm else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.conv(x)
+        return F.relu(x if self.norm is None else self.norm(x))
+
+
+class Fusion(nn.Module):
+    """The feature fusion sub-network (Sec. 3.2): [B, 12, H, W] Z-scored features -> [B, 3, H, W] detail map."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        widths = (FEATURES, width, width, width, 3)
+        norms = (False, True, True, False)
+        self.blocks = nn.ModuleList(FusionBlock(a, b, n) for a, b, n in zip(widths, widths[1:], norms))
+
+    def forward(self, features_z: Tensor) -> Tensor:
+        for block in self.blocks:
+            features_z = block(features_z)
+        return features_z
+
+
+class EncoderLevel(nn.Module):
+    """Convolutions with ReLU; the skip comes after `skip_after` of them, the max-pool (if `pooled`) after the last."""
+
+    def __init__(self, in_channels: int, channels: int, convs: int, skip_after: int, pooled: bool) -> None:
+        super().__init__()
+        self.skip_after, self.pooled = skip_after, pooled
+        self.convs = nn.ModuleList(conv3x3(in_channels if j == 0 else channels, channels) for j in range(convs))
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
+        """[B, C, H, W] -> the skip [B, K, H, W] and what the level below gets, [B, K, H/2, W/2]."""
+        for j, conv in enumerate(self.convs):
+            x = F.relu(conv(x))
+            if j + 1 == self.skip_after:
+                skip = x
+        return skip, F.max_pool2d(x, 2) if self.pooled else None
+
+
+class Encoder(nn.Module):
+    """Five levels. Without `feeds_latent` (the feature encoder) there are no convolutions after the last skip."""
+
+    def __init__(self, in_channels: int, width: int, reading: Reading, feeds_latent: bool) -> None:
+        super().__init__()
+        self.levels = nn.ModuleList()
+        for i, (convs, skip_after) in enumerate(zip(reading.convs, reading.skip_after)):
+            channels = width * LEVEL_FACTORS[i]
+            pooled = feeds_latent or i + 1 < len(LEVEL_FACTORS)
+            self.levels.append(EncoderLevel(in_channels, channels, convs if pooled else skip_after, skip_after, pooled))
+            in_channels = channels
+
+    def forward(self, x: Tensor) -> tuple[list[Tensor], Tensor | None]:
+        """[B, C, H, W] -> the five skips, full resolution first, and the latent's input [B, 8 width, H/32, W/32]."""
+        skips = []
+        for level in self.levels:
+            skip, x = level(x)
+            skips.append(skip)
+        return skips, x
+
+
+class Latent(nn.Module):
+    """conv3x3, BatchNorm in the released reading, ReLU: [B, K, h, w] -> [B, K, h, w]."""
+
+    def __init__(self, channels: int, reading: Reading) -> None:
+        super().__init__()
+        self.conv = conv3x3(channels, channels)
+        self.norm = BatchNorm(channels) if reading.norm else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.conv(x)
+        return F.relu(x if self.norm is None else self.norm(x))
+
+
+class DecoderLevel(nn.Module):
+    """Deconvolution to twice the size, then the 1x1 fusion of ``[decoder | feature skip | HDR skip]`` (Eq. 2)."""
+
+    def __init__(self, in_channels: int, channels: int, skips: int, reading: Reading) -> None:
+        super().__init__()
+        self.fuse_relu = reading.fuse_relu
+        self.deconv = nn.ConvTranspose2d(in_channels, channels, 4, stride=2, padding=1)
+        self.norm = BatchNorm(channels) if reading.norm else None
+        self.fuse = nn.Conv2d(channels * (1 + skips), channels, 1)
+
+    def forward(self, x: Tensor, skips: Sequence[Tensor]) -> Tensor:
+        """[B, Kin, h, w] and skips of [B, K, 2h, 2w] -> [B, K, 2h, 2w]."""
+        x = self.deconv(x)
+        x = F.relu(x if self.norm is None else self.norm(x))
+        x = self.fuse(torch.cat([x, *skips], 1))
+        return F.relu(x) if self.fuse_relu else x
+
+
+class Decoder(nn.Module):
+    """Five levels, the deepest first, and the head (conv3x3 to 3 channels, ReLU)."""
+
+    def __init__(self, width: int, encoders: int, reading: Reading) -> None:
+        super().__init__()
+        widths = [width * factor for factor in (LEVEL_FACTORS[-1], *reversed(LEVEL_FACTORS))]
+        self.levels = nn.ModuleList(DecoderLevel(a, b, encoders, reading) for a, b in zip(widths, widths[1:]))
+        self.head = conv3x3(width, 3)
+
+    def forward(self, latent: Tensor, skips: Sequence[Sequence[Tensor]]) -> Tensor:
+        """The latent and, for each encoder, its five skips (full resolution first) -> [B, 3, H, W], >= 0."""
+        for level, level_skips in zip(self.levels, reversed(list(zip(*skips)))):
+            latent = level(latent, level_skips)
+        return F.relu(self.head(latent))
+
+
+class Denoiser(nn.Module):
+    """The whole network. ``Denoiser(config)`` is initialised as a training run starts (Sec. 4.2), head included."""
+
+    def __init__(self, config: ModelConfig = ModelConfig(), head_bias: Sequence[float] = (0.3, 0.3, 0.3)) -> None:
+        """`head_bias` is the mean gamma-space colour of the training set, which a grey head starts from."""
+        super().__init__()
+        self.config = config
+        self.variant = VARIANTS[config.variant]
+        reading, width = READINGS[config.reading], config.width
+        self.fusion = Fusion(width) if self.variant.fusion else None
+        last = len(self.variant.encoders) - 1
+        self.encoders = nn.ModuleList(
+            Encoder(sum(CHANNELS[name] for name in inputs), width, reading, feeds_latent=e == last)
+            for e, inputs in enumerate(self.variant.encoders)
+        )
+        self.latent = Latent(LEVEL_FACTORS[-1] * width, reading)
+        self.decoder = Decoder(width, last + 1, reading)
+        self._initialise(head_bias)
+
+    def forward(self, color_gamma: Tensor, features_z: Tensor) -> Tensor:
+        """[B, 3, H, W] gamma-space colour and [B, 12, H, W] Z-scored features -> [B, 3, H, W], gamma space, >= 0."""
+        planes = {"color": color_gamma, "features": features_z}
+        if self.fusion is not None:
+            planes["detail"] = self.fusion(features_z)
+        skips = []
+        for encoder, names in zip(self.encoders, self.variant.encoders):
+            encoder_skips, pooled = encoder(torch.cat([planes[name] for name in names], 1))
+            skips.append(encoder_skips)
+        return self.decoder(self.latent(pooled), skips)
+
+    def detail_map(self, features_z: Tensor) -> Tensor | None:
+        """[B, 12, H, W] -> [B, 3, H, W] (Fig. 2 e); None where the variant has no fusion sub-network."""
+        return None if self.fusion is None else self.fusion(features_z)
+
+    @torch.no_grad()
+    def _initialise(self, head_bias: Sequence[float]) -> None:
+        for module in self.modules():
+            if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
+                nn.init.zeros_(module.bias)
+            if isinstance(module, nn.ConvTranspose2d):
+                module.weight.copy_(bilinear_kernel(*module.weight.shape[:2]))
+            elif isinstance(module, nn.Conv2d):
+                nn.init.xavier_uniform_(module.weight)
+        for level in self.decoder.levels:
+            channels, inputs = level.fuse.weight.shape[:2]
+            level.fuse.weight.copy_(torch.eye(channels).repeat(1, inputs // channels)[:, :, None, None])
+        if self.config.head == "grey":
+            self.decoder.head.weight.mul_(GREY_HEAD_SCALE)
+            self.decoder.head.bias.copy_(torch.tensor(head_bias))
+
+
+def bilinear_kernel(in_channels: int, out_channels: int) -> Tensor:
+    """Weight [in, out, 4, 4] of a deconvolution that up-samples bilinearly, channel by channel (Sec. 4.2)."""
+    line = torch.tensor([0.25, 0.75, 0.75, 0.25])
+    return torch.eye(in_channels, out_channels)[:, :, None, None] * torch.outer(line, line)

@@ -1,0 +1,227 @@
+"""Makes the parity fixtures from the PyTorch twin (`pip install ./python`): `python tests/parity/make_fixtures.py`.
+
+Everything is computed in float64 and stored as float32, so that a fixture is the truth to the last bit of a float32 and
+does not depend on the machine; whatever a test measures is the error of the Rust side. Names of tensors are PyTorch's.
+
+- `inputs.safetensors`: one batch, `color_gamma`, `features_z`, `reference_hdr`.
+- `VARIANT-READING.safetensors`: `weight/*`, `output_eval` and, in train mode, `output_train`, `loss`, `grad/*`, and
+  `adam/*`: weights and running statistics after 5 steps of Adam on the same batch.
+- `blocks.safetensors`: inputs, outputs and gradients of single blocks of `demc-*`, for the loss
+  `sum(outputs * probes)`; and the loss function on its own.
+
+What makes a gradient test worth something, and what makes one fail for nothing: outputs of order 1, no gradient that
+vanishes but those that must, and no ReLU so close to its kink that rounding decides. The script checks all of it, the
+last by a float32 run of PyTorch, which must stay within a fifth of the tolerances of the Rust tests.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.numpy import save
+from torch import Tensor, nn
+
+from demc import Denoiser, ModelConfig, hdr_from_gamma, rel_mse
+from demc.network import READINGS, VARIANTS
+
+FIXTURES = Path(__file__).parent / "fixtures"
+WIDTH = 2
+SHAPE = (2, 64, 64)  # batch, height, width: the latent is 2 x 2, the least where each tap of its 3x3 kernels counts
+SEED = 0  # found by trial: the checks say no to some
+STEPS, LEARNING_RATE = 5, 1e-3
+MARGIN = 0.2  # share of the Rust tests' tolerances that float32 rounding may use up
+OUTPUT_TOLERANCE = 1e-5  # of the largest value; these three are those of tests/tests/parity/
+GRADIENT_TOLERANCE = (2e-5, 1e-4)  # of the tensor's largest value, and of the value itself
+ADAM_TOLERANCE = 0.02  # of the path of a weight whose gradient keeps its sign, STEPS * LEARNING_RATE
+
+
+def main() -> None:
+    torch.set_num_threads(1)  # one order of summation
+    FIXTURES.mkdir(exist_ok=True)
+    batch = draw_batch(np.random.RandomState(0))
+    write("inputs", batch)
+    blocks = loss_block(np.random.RandomState(2))
+    for variant in VARIANTS:
+        for reading in READINGS:
+            config = ModelConfig(variant, reading, WIDTH)
+            weights = draw_weights(config, batch, np.random.RandomState(SEED))
+            results = run(config, weights, batch, torch.float64)
+            check_alive(config, results)
+            worst = check_robust(config, results, run(config, weights, batch, torch.float32))
+            print(f"{variant}-{reading}: float32 takes at most {worst:.3f} of a tolerance")
+            write(f"{variant}-{reading}", {f"weight/{name}": value for name, value in weights.items()} | results)
+            if variant == "demc":
+                blocks |= blocks_of(config, weights)
+    write("blocks", blocks)
+
+
+def write(name: str, tensors: dict[str, Tensor]) -> None:
+    arrays = {key: np.ascontiguousarray(t.detach().numpy(), np.float32) for key, t in tensors.items()}
+    (FIXTURES / f"{name}.safetensors").write_bytes(save(arrays))
+
+
+def tensor(values: np.ndarray) -> Tensor:
+    """Values as float64, but exactly those that the file will hold."""
+    return torch.from_numpy(np.float32(values)).double()
+
+
+def draw_batch(random: np.random.RandomState) -> dict[str, Tensor]:
+    """RandomState, because NumPy has frozen its stream for good."""
+    b, h, w = SHAPE
+    return {
+        "color_gamma": tensor(random.uniform(0, 1.5, (b, 3, h, w))),
+        "features_z": tensor(random.randn(b, 12, h, w)),
+        "reference_hdr": tensor(random.uniform(0.2, 2, (b, 3, h, w))),
+    }
+
+
+def draw_weights(config: ModelConfig, batch: dict[str, Tensor], random: np.random.RandomState) -> dict[str, Tensor]:
+    """Random weights, then one pass that shifts and scales each convolution so that every channel of its output has a
+    mean near 0.75 and a deviation of 0.7: at a width of 2, plain random weights leave half of the network dead."""
+    model = Denoiser(config).double().eval()
+    ranges = {"running_mean": (0.4, 1.0), "running_var": (0.3, 0.8), "weight": (0.5, 0.9), "bias": (0.6, 0.9)}
+    for name, value in model.state_dict().items():
+        shape, limits = tuple(value.shape), ranges[name.split(".")[-1]]
+        value.copy_(tensor(random.randn(*shape) if len(shape) == 4 else random.uniform(*limits, shape)))
+
+    def calibrate(conv: nn.Module, inputs: tuple[Tensor], output: Tensor) -> Tensor:
+        channels = 1 if isinstance(conv, nn.ConvTranspose2d) else 0  # axis of the weight
+        scale = 0.7 / output.std((0, 2, 3))
+        conv.weight.mul_(scale.view([-1 if axis == channels else 1 for axis in range(4)]))
+        target = tensor(random.uniform(0.6, 0.9, scale.shape))
+        conv.bias.copy_((conv.bias - output.mean((0, 2, 3))) * scale + target)
+        return type(conv).forward(conv, *inputs)
+
+    for module in model.modules():
+        if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
+            module.register_forward_hook(calibrate)
+    with torch.no_grad():
+        model(batch["color_gamma"], batch["features_z"])
+    return {name: tensor(value.numpy()) for name, value in model.state_dict().items()}
+
+
+def zero_by_construction(config: ModelConfig, name: str) -> bool:
+    """A bias before a batch normalisation: the normalisation takes the mean away again."""
+    normed = ("deconv.bias", "latent.conv.bias") if READINGS[config.reading].norm else ()
+    return name.endswith(("fusion.blocks.1.conv.bias", "fusion.blocks.2.conv.bias", *normed))
+
+
+def run(
+    config: ModelConfig, weights: dict[str, Tensor], batch: dict[str, Tensor], dtype: torch.dtype
+) -> dict[str, Tensor]:
+    """What a fixture holds but the weights: both outputs, the loss, gradients, and Adam's result."""
+    model = Denoiser(config)
+    model.load_state_dict(weights, strict=True)
+    model.to(dtype)
+    color, features, reference = (batch[name].to(dtype) for name in ("color_gamma", "features_z", "reference_hdr"))
+    with torch.no_grad():
+        result = {"output_eval": model.eval()(color, features)}
+    model.train()
+    adam = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE, betas=(0.9, 0.999), eps=1e-8)
+    for step in range(STEPS):
+        output = model(color, features)
+        loss = rel_mse(hdr_from_gamma(output), reference)
+        adam.zero_grad()
+        loss.backward()
+        if step == 0:
+            result |= {"output_train": output.detach(), "loss": loss.detach().reshape(1)}
+            result |= {f"grad/{name}": p.grad.clone() for name, p in model.named_parameters()}
+        adam.step()
+    return result | {f"adam/{name}": value.clone() for name, value in model.state_dict().items()}
+
+
+def check_alive(config: ModelConfig, results: dict[str, Tensor]) -> None:
+    """Fails where outputs are far from order 1 or a gradient that should not be zero nearly is."""
+    for name, value in results.items():
+        zeros, largest = (value == 0).double().mean(), value.abs().max()
+        if name.startswith("output"):
+            good = 0.3 < value.mean() < 2 and largest < 10 and zeros < 0.3
+        elif name.startswith("grad/") and not zero_by_construction(config, name):
+            good = largest > 1e-3 and zeros < 0.3
+        else:
+            continue
+        if not good:
+            raise RuntimeError(f"{config}: {name}: largest {largest:.1e}, {zeros:.0%} zeros")
+
+
+def check_robust(config: ModelConfig, results: dict[str, Tensor], single: dict[str, Tensor]) -> float:
+    """The largest share of a tolerance that float32 rounding takes; fails where it is more than MARGIN."""
+    shares = {}
+    for name, expected in results.items():
+        if zero_by_construction(config, name) or name.endswith("running_mean"):
+            continue  # Adam walks such a bias at random, and the running mean after it follows
+        scale = expected.abs()
+        if name.startswith("grad/"):
+            tolerance = GRADIENT_TOLERANCE[0] * scale.max() + GRADIENT_TOLERANCE[1] * scale
+        elif name.startswith("adam/"):
+            tolerance = torch.tensor(ADAM_TOLERANCE * STEPS * LEARNING_RATE)
+        else:
+            tolerance = OUTPUT_TOLERANCE * scale.max()
+        shares[name] = ((single[name].double() - expected).abs() / tolerance).max().item()
+    name = max(shares, key=shares.get)
+    if shares[name] > MARGIN:
+        raise RuntimeError(f"{config}: {name}: float32 takes {shares[name]:.2f} of the tolerance")
+    return shares[name]
+
+
+def blocks_of(config: ModelConfig, weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The blocks of a network by their paths, on inputs of their own."""
+    random = np.random.RandomState(1)
+    k = WIDTH
+
+    def normal(channels: int, height: int, width: int) -> Tensor:
+        return tensor(random.randn(2, channels, height, width))
+
+    cases = {
+        "fusion": [normal(12, 8, 16)],
+        "encoders.0.levels.4": [normal(8 * k, 4, 6)],  # the one that stops at its skip in the paper's reading
+        "encoders.1.levels.1": [normal(k, 8, 12)],
+        "latent": [normal(8 * k, 4, 6)],
+        "decoder.levels.3": [normal(4 * k, 4, 6), normal(2 * k, 8, 12), normal(2 * k, 8, 12)],
+        "decoder.head": [normal(k, 8, 12)],
+    }
+    tensors = {}
+    for path, inputs in cases.items():
+        model = Denoiser(config).double()
+        model.load_state_dict(weights, strict=True)
+        block = model.get_submodule(path)
+        forward = (lambda x, *skips: block(x, skips)) if path.startswith("decoder.levels") else block
+        case = {f"input.{i}": x for i, x in enumerate(inputs)}
+        with torch.no_grad():
+            block.eval()
+            case |= {f"eval.{i}": y for i, y in enumerate(outputs_of(forward, inputs))}
+            block.train()
+        outputs = outputs_of(forward, [x.requires_grad_() for x in inputs])
+        probes = [tensor(random.uniform(0.5, 1.5, tuple(y.shape))) for y in outputs]
+        sum((y * probe).sum() for y, probe in zip(outputs, probes)).backward()
+        case |= {f"train.{i}": y for i, y in enumerate(outputs)} | {f"probe.{i}": p for i, p in enumerate(probes)}
+        case |= {f"input_grad.{i}": x.grad for i, x in enumerate(inputs)}
+        case |= {f"grad.{name}": p.grad for name, p in block.named_parameters()}
+        case |= {f"after.{name}": b for name, b in block.named_buffers()}
+        tensors |= {f"{config.reading}/{path}/{name}": value for name, value in case.items()}
+    return tensors
+
+
+def outputs_of(forward, inputs: list[Tensor]) -> list[Tensor]:
+    outputs = forward(*inputs)
+    return [y for y in outputs if y is not None] if isinstance(outputs, tuple) else [outputs]
+
+
+def loss_block(random: np.random.RandomState) -> dict[str, Tensor]:
+    """RelMSE after `hdr_from_gamma`, with outputs at 0, where x^2.2 has gradient 0, and black reference pixels."""
+    output = tensor(random.uniform(0, 1.5, (2, 3, 8, 12)))
+    output[:, :, ::4, ::4] = 0
+    reference = tensor(random.uniform(0.2, 2, (2, 3, 8, 12)))
+    reference[:, :, 2::4, 2::4] = 0
+    loss = rel_mse(hdr_from_gamma(output.requires_grad_()), reference)
+    loss.backward()
+    return {
+        "loss/output_gamma": output,
+        "loss/reference_hdr": reference,
+        "loss/loss": loss.reshape(1),
+        "loss/grad": output.grad,
+    }
+
+
+if __name__ == "__main__":
+    main()

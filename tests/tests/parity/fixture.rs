@@ -1,0 +1,135 @@
+//! The fixtures as weights, tensors and expectations; gradients by name.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use burn::module::{Module, ModuleVisitor, Param};
+use burn::optim::GradientsParams;
+use burn::tensor::{Device, Tensor, TensorData};
+use demc_infer::Names;
+use demc_model::{Denoiser, Head, ModelConfig, Reading, Variant, Weight, Weights};
+
+use crate::tensors::{self, Values};
+
+/// The width of the fixtures' networks.
+const WIDTH: usize = 2;
+
+/// One fixture file. Its tensors have PyTorch's names, after a prefix.
+pub struct Fixture(BTreeMap<String, Values>);
+
+impl Fixture {
+    /// The file `name`.safetensors.
+    pub fn read(name: &str) -> Self {
+        let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("parity/fixtures");
+        Fixture(tensors::read(&folder.join(format!("{name}.safetensors"))))
+    }
+
+    /// A tensor's values.
+    pub fn values(&self, name: &str) -> &[f32] {
+        let found = self
+            .0
+            .get(name)
+            .unwrap_or_else(|| panic!("the fixture has no tensor {name}"));
+        &found.data
+    }
+
+    /// A tensor on `device`.
+    pub fn tensor(&self, name: &str, device: &Device) -> Tensor<4> {
+        let data = TensorData::new(self.values(name).to_vec(), self.0[name].shape.clone());
+        Tensor::from_data(data, device)
+    }
+
+    /// The tensors `prefix.0`, `prefix.1`, ... on `device`.
+    pub fn list(&self, prefix: &str, device: &Device) -> Vec<Tensor<4>> {
+        let names = (0..).map(|i| format!("{prefix}.{i}"));
+        names
+            .take_while(|name| self.0.contains_key(name))
+            .map(|name| self.tensor(&name, device))
+            .collect()
+    }
+
+    /// All tensors whose names begin with `prefix`, under Burn's names without it.
+    pub fn group(&self, prefix: &str) -> Vec<Weight> {
+        let weight = |(name, values): (&String, &Values)| {
+            let name = Names::Torch.to_burn(name);
+            let (shape, data) = (values.shape.clone(), values.data.clone());
+            Some(Weight {
+                name: name.strip_prefix(prefix)?.to_string(),
+                shape,
+                data,
+            })
+        };
+        self.0.iter().filter_map(weight).collect()
+    }
+}
+
+/// The name of a fixture file.
+pub fn network_name(variant: Variant, reading: Reading) -> String {
+    format!("{}-{}", variant.spec().name, reading.spec().name)
+}
+
+/// The network of a fixture file, on `device`.
+pub fn network(variant: Variant, reading: Reading, fixture: &Fixture, device: &Device) -> Denoiser {
+    let config = ModelConfig {
+        variant,
+        reading,
+        width: WIDTH,
+        head: Head::Grey,
+    };
+    let mut weights = Weights::new(fixture.group("weight/"));
+    config
+        .load(&mut weights, device)
+        .expect("the fixture has the weights of the network")
+}
+
+/// The values of a tensor.
+pub fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+    tensor
+        .into_data()
+        .try_to_vec()
+        .expect("float32 on every device here")
+}
+
+/// The gradients of a module's parameters, by their names.
+pub fn gradients_by_name(
+    module: &impl Module,
+    gradients: &GradientsParams,
+) -> BTreeMap<String, Vec<f32>> {
+    struct Collector<'a> {
+        path: Vec<String>,
+        gradients: &'a GradientsParams,
+        found: BTreeMap<String, Vec<f32>>,
+    }
+
+    impl ModuleVisitor for Collector<'_> {
+        fn enter_module(&mut self, name: &str, _container_type: &str) {
+            self.path.push(name.to_string());
+        }
+
+        fn exit_module(&mut self, _name: &str, _container_type: &str) {
+            self.path.pop();
+        }
+
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            if let Some(gradient) = self.gradients.get::<D>(param.id) {
+                self.found.insert(self.path.join("."), host(gradient));
+            }
+        }
+    }
+
+    let mut collector = Collector {
+        path: Vec::new(),
+        gradients,
+        found: BTreeMap::new(),
+    };
+    module.visit(&mut collector);
+    collector.found
+}
+
+/// Whether a weight is a bias before a batch normalisation, which takes it away again with the mean: its gradient is
+/// zero by construction, what float32 leaves of it is noise.
+pub fn is_bias_before_norm(name: &str, reading: Reading) -> bool {
+    let fused = ["fusion.blocks.1.conv.bias", "fusion.blocks.2.conv.bias"].contains(&name);
+    let decoded = name == "latent.conv.bias" || name.ends_with("deconv.bias");
+    fused || reading == Reading::Released && decoded
+}

@@ -1,0 +1,207 @@
+//! Parity with the PyTorch of this machine: weights drawn here, exported, loaded by `python/` with `strict=True`, run.
+//!
+//! Needs a Python with the package of `python/` (`pip install ./python`), named by `DEMC_PYTHON` (default `python3`).
+//! Without one the test says that it was skipped; with `DEMC_REQUIRE_TORCH=1` it fails.
+
+#[path = "parity/tensors.rs"]
+mod tensors;
+
+use std::collections::HashMap;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use burn::tensor::{Device, Tensor, TensorData};
+use demc_data::{ChannelLayout, FeatureStats, Normalizer};
+use demc_infer::{Bundle, BundleMeta, Names, Precision};
+use demc_model::{Head, ModelConfig, Reading, Variant, Weight, Weights};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use safetensors::tensor::{Dtype, TensorView};
+use tempfile::TempDir;
+use tensors::{Tolerance, assert_close, read};
+
+/// Not square and of two images; nothing in a file says it.
+const SHAPE: [usize; 4] = [2, 3, 64, 96];
+const FEATURES: usize = 12;
+const WIDTH: usize = 4;
+
+/// What the project promises, against the output's largest value; measured: 1e-6.
+const OUTPUT: Tolerance = Tolerance {
+    absolute: 0.0,
+    of_largest: 1e-4,
+    of_value: 0.0,
+};
+
+#[test]
+fn pytorch_loads_every_export_strictly_and_agrees() {
+    let python = Python::of_this_machine();
+    if let Err(reason) = python.check() {
+        assert!(
+            std::env::var("DEMC_REQUIRE_TORCH").as_deref() != Ok("1"),
+            "DEMC_REQUIRE_TORCH=1, but {reason}"
+        );
+        // Not `println!`, which the test harness swallows.
+        writeln!(std::io::stderr(), "skipped: {reason}").expect("stderr can be written");
+        return;
+    }
+    for variant in Variant::ALL {
+        for reading in Reading::ALL {
+            python.agrees(variant, reading, Names::Torch, Precision::F32);
+        }
+    }
+    python.agrees(
+        Variant::Demc,
+        Reading::Released,
+        Names::Burn,
+        Precision::F32,
+    );
+    python.agrees(
+        Variant::Demc,
+        Reading::Released,
+        Names::Torch,
+        Precision::F16,
+    );
+}
+
+/// A Python interpreter.
+struct Python(String);
+
+impl Python {
+    fn of_this_machine() -> Self {
+        Python(std::env::var("DEMC_PYTHON").unwrap_or_else(|_| "python3".into()))
+    }
+
+    /// Whether it has what the test needs; else why not.
+    fn check(&self) -> Result<(), String> {
+        let Python(program) = self;
+        let output = self
+            .run(["-c", "import torch, demc"])
+            .map_err(|e| format!("{program} does not run: {e}"))?;
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        let last = stderr.lines().last().unwrap_or_default();
+        match output.status.success() {
+            true => Ok(()),
+            false => Err(format!(
+                "{program} cannot import torch and demc (pip install ./python): {last}"
+            )),
+        }
+    }
+
+    fn run<const N: usize>(&self, arguments: [&str; N]) -> std::io::Result<Output> {
+        // From a directory without a package `demc`, so that the installed one is found.
+        Command::new(&self.0)
+            .args(arguments)
+            .current_dir(env!("CARGO_MANIFEST_DIR"))
+            .output()
+    }
+
+    fn agrees(&self, variant: Variant, reading: Reading, names: Names, precision: Precision) {
+        let what = format!(
+            "{}, {} reading, {names:?} names, {precision:?}",
+            variant.spec().name,
+            reading.spec().name
+        );
+        let folder = TempDir::new().expect("a temporary directory");
+        let [bundle, input, output] = ["bundle", "input", "output"]
+            .map(|name| folder.path().join(name).with_extension("safetensors"));
+        let mut rng = ChaCha8Rng::seed_from_u64(2019);
+        random_bundle(variant, reading, &mut rng)
+            .save(&bundle, names, precision)
+            .expect("the bundle is written");
+        let [_, colors, height, width] = SHAPE;
+        let color_gamma = uniform(0.0, 1.5, SHAPE[0] * colors * height * width, &mut rng);
+        let features_z = uniform(-1.7, 1.7, SHAPE[0] * FEATURES * height * width, &mut rng);
+        write_input(&input, &color_gamma, &features_z);
+
+        let text = |path: &PathBuf| path.to_str().expect("a path in UTF-8").to_string();
+        let run = self
+            .run(["-m", "demc", &text(&bundle), &text(&input), &text(&output)])
+            .expect("it ran before");
+        assert!(
+            run.status.success(),
+            "{what}: {}",
+            String::from_utf8_lossy(&run.stderr)
+        );
+
+        // Rounding to f16 has been done once, in the file, for both sides.
+        let device = Device::flex();
+        let model = Bundle::load(&bundle, &device)
+            .expect("the bundle loads")
+            .model;
+        let tensor = |values, channels| {
+            Tensor::<4>::from_data(
+                TensorData::new(values, [SHAPE[0], channels, height, width]),
+                &device,
+            )
+        };
+        let ours = model.forward(tensor(color_gamma, colors), tensor(features_z, FEATURES));
+        let ours: Vec<f32> = ours.into_data().try_to_vec().expect("float32");
+        let theirs = &read(&output)["output"];
+        assert_eq!(theirs.shape, SHAPE, "{what}");
+        let lit = theirs.data.iter().filter(|&&v| v > 0.1).count();
+        assert!(
+            lit > theirs.data.len() / 2,
+            "{what}: an output of nearly only zeros tests nothing"
+        );
+        let share = assert_close(&what, &ours, &theirs.data, OUTPUT);
+        println!(
+            "{what}: {:.1e} of the largest value",
+            share * OUTPUT.of_largest
+        );
+    }
+}
+
+/// A network with its initial weights moved at random, so that no bias is zero and no running statistic trivial.
+fn random_bundle(variant: Variant, reading: Reading, rng: &mut ChaCha8Rng) -> Bundle {
+    let config = ModelConfig {
+        variant,
+        reading,
+        width: WIDTH,
+        head: Head::Grey,
+    };
+    let device = Device::flex();
+    let mut weights = config.init(rng, [0.5, 0.4, 0.3], &device).weights();
+    for Weight { data, .. } in &mut weights {
+        data.iter_mut()
+            .for_each(|value| *value += rng.random_range(-0.05..0.1));
+    }
+    let normalizer = Normalizer {
+        gamma: 2.2,
+        features: FeatureStats {
+            mean: [0.0; FEATURES],
+            std: [1.0; FEATURES],
+        },
+        flat_color: [0.5, 0.4, 0.3],
+    };
+    let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
+    Bundle {
+        model: config
+            .load(&mut Weights::new(weights), &device)
+            .expect("its own weights"),
+        meta: BundleMeta::new(config, normalizer, layout, 0),
+    }
+}
+
+fn uniform(low: f32, high: f32, count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    (0..count).map(|_| rng.random_range(low..high)).collect()
+}
+
+fn write_input(path: &Path, color_gamma: &[f32], features_z: &[f32]) {
+    let bytes = |values: &[f32]| {
+        values
+            .iter()
+            .flat_map(|v| v.to_le_bytes())
+            .collect::<Vec<u8>>()
+    };
+    let (color, features) = (bytes(color_gamma), bytes(features_z));
+    let shape = |channels| vec![SHAPE[0], channels, SHAPE[2], SHAPE[3]];
+    let view = |channels, bytes| {
+        TensorView::new(Dtype::F32, shape(channels), bytes).expect("a shape that fits")
+    };
+    let views = HashMap::from([
+        ("color_gamma", view(SHAPE[1], &color)),
+        ("features_z", view(FEATURES, &features)),
+    ]);
+    safetensors::serialize_to_file(views, None, path).expect("a writable temporary directory");
+}
