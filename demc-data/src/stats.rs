@@ -79,7 +79,9 @@ impl Statistics {
                         .features
                         .map(|moments| (moments.std() as f32).max(STD_FLOOR)),
                 },
-                flat_color: total.color.map(|channel| channel.best().powf(1.0 / f64::from(gamma)) as f32),
+                flat_color: total
+                    .color
+                    .map(|channel| channel.best().powf(1.0 / f64::from(gamma)) as f32),
             },
             pixels: total.pixels,
             misses: total.misses,

@@ -82,11 +82,11 @@ pub fn parse(name: &str) -> Result<Device, DeviceError> {
 }
 
 #[cfg(feature = "ndarray")]
+#[expect(
+    deprecated,
+    reason = "deprecated upstream in favour of flex; offered while 0.22 has it"
+)]
 fn ndarray(_name: &str) -> Result<Device, DeviceError> {
-    #[expect(
-        deprecated,
-        reason = "deprecated upstream in favour of flex; offered while 0.22 has it"
-    )]
     Ok(Device::ndarray())
 }
 

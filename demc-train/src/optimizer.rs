@@ -243,6 +243,11 @@ mod tests {
         )
     }
 
+    /// Without the running statistics, which every forward pass moves.
+    fn trainable(weights: Vec<Weight>) -> Vec<Weight> {
+        weights.into_iter().filter(Weight::is_trainable).collect()
+    }
+
     /// The whole-module optimizer of Burn is the oracle.
     #[test]
     fn steps_are_burns_own_bit_for_bit() {
@@ -257,8 +262,8 @@ mod tests {
             let grads = gradient(&ours, &device);
             ours = adam.step(1e-3, ours, grads);
         }
-        assert_ne!(ours.weights(), model(&device).weights());
-        assert_eq!(ours.weights(), theirs.weights());
+        assert!(trainable(ours.weights()) != trainable(model(&device).weights()));
+        assert!(ours.weights() == theirs.weights());
     }
 
     #[test]
@@ -272,7 +277,7 @@ mod tests {
         let grads = || gradient(&first, &device);
         let a = adam.step(1e-3, first.clone(), grads()).weights();
         let b = again.step(1e-3, first.clone(), grads()).weights();
-        assert_eq!(a, b);
+        assert!(trainable(a) == trainable(b));
     }
 
     #[test]

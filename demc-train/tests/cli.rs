@@ -1,0 +1,154 @@
+//! What the program says and writes, as a stranger meets it.
+
+mod common;
+
+use std::fs;
+
+use common::{config, error_line, stderr, train};
+
+#[test]
+fn a_short_run_leaves_everything_behind() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let run = dir.path().join("run");
+    let output = train(&config(dir.path()), &run, &["--set", "train.steps=4"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert_eq!(stderr(&output), "", "quiet where stderr is no terminal");
+
+    let text = String::from_utf8_lossy(&output.stdout);
+    let first = text.lines().next().expect("a line");
+    assert!(
+        first.starts_with("demc-train: about ") && first.contains("a step"),
+        "{first}"
+    );
+    assert!(
+        text.contains("| mean "),
+        "the table of the test split: {text}"
+    );
+
+    for file in [
+        "config.toml",
+        "run.json",
+        "metrics.jsonl",
+        "latest",
+        "best.safetensors",
+        "checkpoints/step-00000004/model.safetensors",
+        "strips/step-00000004.png",
+        "strips/test.png",
+        "test.json",
+    ] {
+        assert!(run.join(file).is_file(), "{file}");
+    }
+    let log = fs::read_to_string(run.join("metrics.jsonl")).expect("a log");
+    let last: serde_json::Value =
+        serde_json::from_str(log.lines().last().expect("a line")).expect("JSON");
+    for key in [
+        "step",
+        "loss",
+        "lr",
+        "valid_relmse",
+        "valid_ssim",
+        "elapsed_s",
+    ] {
+        assert!(last[key].is_number(), "{key}: {last}");
+    }
+    let test: serde_json::Value =
+        serde_json::from_slice(&fs::read(run.join("test.json")).expect("scores")).expect("JSON");
+    assert_eq!(test["images"].as_array().expect("images").len(), 4);
+}
+
+#[test]
+fn every_variant_and_reading_trains() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    for variant in ["demc", "demc-nosn", "semc"] {
+        for reading in ["paper", "released"] {
+            let run = dir.path().join(format!("{variant}-{reading}"));
+            let (variant, reading) = (
+                format!("model.variant={variant}"),
+                format!("model.reading={reading}"),
+            );
+            let sets = [
+                "--set",
+                &variant,
+                "--set",
+                &reading,
+                "--set",
+                "train.steps=1",
+                "--set",
+                "data.validation=0",
+            ];
+            let output = train(&config, &run, &sets);
+            assert!(
+                output.status.success(),
+                "{variant} {reading}: {}",
+                stderr(&output)
+            );
+        }
+    }
+}
+
+#[test]
+fn check_writes_nothing() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let run = dir.path().join("run");
+    let output = train(&config(dir.path()), &run, &["--check"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert!(!run.exists());
+}
+
+#[test]
+fn bad_configurations_exit_with_2_and_one_line() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    let run = dir.path().join("run");
+    let error = |set: &str| error_line(&train(&config, &run, &["--set", set]), 2);
+    assert!(error("train.step=3").contains("did you mean `train.steps`?"));
+    assert!(error("model.variant=unet").contains("demc-nosn"));
+    let all = error_line(
+        &train(
+            &config,
+            &run,
+            &["--set", "train.steps=0", "--set", "data.stride=0"],
+        ),
+        2,
+    );
+    assert!(
+        all.contains("train.steps") && all.contains("data.stride"),
+        "all at once: {all}"
+    );
+
+    let misspelt = dir.path().join("misspelt.toml");
+    fs::write(&misspelt, "[model]\n\nwidht = 3\n").expect("a file");
+    let error = error_line(&train(&misspelt, &run, &[]), 2);
+    assert!(
+        error.contains("misspelt.toml:3: unknown key `model.widht`; did you mean `model.width`?"),
+        "{error}"
+    );
+    let error = error_line(&train(&dir.path().join("none.toml"), &run, &[]), 2);
+    assert!(error.contains("none.toml"), "{error}");
+    assert!(!run.exists(), "nothing is written");
+}
+
+#[test]
+fn bad_worlds_exit_with_1_and_one_line() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    let run = dir.path().join("run");
+    let error = |args: &[&str]| error_line(&train(&config, &run, args), 1);
+    assert!(error(&["--device", "tpu"]).contains("known devices: flex"));
+    assert!(error(&["--set", "data.root=/nowhere/at/all"]).contains("/nowhere/at/all"));
+    assert!(error(&["--set", "data.layout=blender"]).contains("blender"));
+    assert!(
+        error(&["--set", "data.patch_size=256"]).contains("224"),
+        "a scene smaller than a patch"
+    );
+    assert!(!run.exists(), "nothing is written");
+
+    let file = dir.path().join("file");
+    fs::write(&file, "").expect("a file");
+    let output = train(&config, &file.join("run"), &["--set", "train.steps=1"]);
+    assert!(
+        error_line(&output, 1).contains("file"),
+        "a run directory that cannot be made"
+    );
+}

@@ -1,0 +1,58 @@
+//! What the tests of the program share: the real binary on the committed sample, with a network of a few seconds.
+#![allow(dead_code, reason = "each test file uses its part")]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// The repository's sample data.
+pub fn sample() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../data/sample")
+}
+
+/// A run of twelve steps with everything in it that a resume could lose: batch normalisation, augmentation, two
+/// batches a step, a log that is not in step with the checkpoints.
+pub fn config(dir: &Path) -> PathBuf {
+    let text = format!(
+        "[model]\nwidth = 2\nreading = \"released\"\n\
+         [data]\nroot = {:?}\npatch_size = 64\nbatch_size = 2\nvalidation = 0.2\naugment = true\n\
+         [train]\nsteps = 12\nlr_start = 1e-3\ngrad_accumulation = 2\ngrad_clip = 1.0\n\
+         [run]\nlog_every = 2\nvalidate_every = 4\ncheckpoint_every = 3\nkeep = 2\n",
+        sample()
+    );
+    let path = dir.join("tiny.toml");
+    std::fs::write(&path, text).expect("a temporary directory");
+    path
+}
+
+/// `demc-train --config CONFIG --run-dir RUN ARGS...`
+pub fn command(config: &Path, run: &Path, args: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_demc-train"));
+    command
+        .arg("--config")
+        .arg(config)
+        .arg("--run-dir")
+        .arg(run)
+        .args(args);
+    command
+}
+
+/// Runs it to the end.
+pub fn train(config: &Path, run: &Path, args: &[&str]) -> Output {
+    command(config, run, args)
+        .output()
+        .expect("the binary runs")
+}
+
+/// Standard error as text.
+pub fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// The one line that a failure prints, its exit code checked.
+pub fn error_line(output: &Output, code: i32) -> String {
+    let text = stderr(output);
+    assert_eq!(output.status.code(), Some(code), "{text}");
+    assert_eq!(text.lines().count(), 1, "one line: {text}");
+    assert!(text.starts_with("error: "), "{text}");
+    text
+}
