@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 
 use burn::optim::GradientsParams;
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use demc_model::metrics::{LOSS_EPSILON, hdr_from_gamma, rel_mse};
 use demc_model::{Denoiser, Reading, Variant};
 
@@ -79,7 +79,7 @@ fn head_is_pytorchs() {
 #[test]
 fn loss_and_its_gradient_are_pytorchs_at_black_pixels_too() {
     let fixture = Fixture::read("blocks");
-    let device = Device::flex().autodiff();
+    let device = crate::device().autodiff();
     let output = fixture.tensor("loss/output_gamma", &device).require_grad();
     let reference = fixture.tensor("loss/reference_hdr", &device);
     let loss = rel_mse(hdr_from_gamma(output.clone(), 2.2), reference, LOSS_EPSILON);
@@ -127,7 +127,7 @@ fn check(fixture: &Fixture, reading: Reading, path: &str, forward: Forward) -> S
     let weights = Fixture::read(&network_name(Variant::Demc, reading));
     let prefix = format!("{}/{path}", reading.spec().name);
     let outputs_close = |mode: &str, outputs: &[Tensor<4>]| {
-        let expected = fixture.list(&format!("{prefix}/{mode}"), &Device::flex());
+        let expected = fixture.list(&format!("{prefix}/{mode}"), &crate::device());
         assert_eq!(outputs.len(), expected.len(), "{prefix}: number of outputs");
         let pairs = outputs.iter().zip(expected).map(|(found, expected)| {
             assert_eq!(found.dims(), expected.dims(), "{prefix}");
@@ -141,7 +141,7 @@ fn check(fixture: &Fixture, reading: Reading, path: &str, forward: Forward) -> S
         pairs.fold(0.0, f32::max)
     };
 
-    let device = Device::flex();
+    let device = crate::device();
     let model = network(Variant::Demc, reading, &weights, &device);
     let eval = outputs_close(
         "eval",

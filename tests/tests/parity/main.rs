@@ -1,13 +1,22 @@
 //! Parity with PyTorch on committed fixtures: each block, each variant in each reading, the loss, every gradient, five
 //! steps of Adam. No Python is needed here; `tests/parity/make_fixtures.py` makes the fixtures, in float64, so the
 //! deviations are those of this side. `parity_live.rs` compares with a PyTorch that is there.
+//!
+//! `DEMC_DEVICE` names the device (default `flex`), so the same numbers are asked of every backend that was built.
 
 mod blocks;
 mod fixture;
 mod networks;
 mod tensors;
 
+use burn::tensor::Device;
 use tensors::Tolerance;
+
+/// The device under test.
+pub fn device() -> Device {
+    let name = std::env::var("DEMC_DEVICE").unwrap_or_else(|_| "flex".into());
+    demc_infer::device::parse(&name).unwrap_or_else(|error| panic!("{error}"))
+}
 
 /// Outputs: a float32 PyTorch is off by up to 1e-6 of the largest value, after 27 layers.
 pub const OUTPUT: Tolerance = Tolerance {

@@ -103,7 +103,7 @@ fn check(variant: Variant, reading: Reading) {
     let fixture = Fixture::read(&name);
     let eval = check_eval(variant, reading, &fixture);
 
-    let device = Device::flex().autodiff();
+    let device = crate::device().autodiff();
     let batch = Batch::read(&device);
     let model = network(variant, reading, &fixture, &device);
     let train = check_first_step(&model, &batch, reading, &fixture);
@@ -115,7 +115,7 @@ fn check(variant: Variant, reading: Reading) {
 }
 
 fn check_eval(variant: Variant, reading: Reading, fixture: &Fixture) -> f32 {
-    let device = Device::flex();
+    let device = crate::device();
     let model = network(variant, reading, fixture, &device);
     let output = host(Batch::read(&device).output(&model));
     assert_close(
