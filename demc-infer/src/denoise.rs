@@ -2,11 +2,16 @@
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData, TensorReadError};
+use demc_data::frame::FEATURE_NAMES;
 use demc_data::{FEATURES, Frame};
 use demc_model::config::COLOR_CHANNELS;
 
 use crate::Bundle;
 use crate::padding::Padding;
+
+/// How many training deviations the mean of a feature channel may lie from the training mean. Ours: millimetres where
+/// metres were trained on are about this far; a large scene after small ones is not.
+pub const FARTHEST_MEAN: f64 = 1000.0;
 
 /// Why a frame could not be denoised.
 #[derive(Debug, thiserror::Error)]
@@ -27,6 +32,22 @@ pub enum DenoiseError {
         width: usize,
         /// The frame's height in pixels.
         height: usize,
+    },
+    /// A feature channel is nowhere near what the network was trained on: another unit, or another buffer.
+    #[error(
+        "{name}: {channel} does not fit the model's statistics: mean {found:.4}, in training {mean:.4} with a deviation of {std:.4}; another unit or another buffer?"
+    )]
+    Statistics {
+        /// The frame.
+        name: String,
+        /// The channel.
+        channel: &'static str,
+        /// Its mean in the frame, in its own unit.
+        found: f64,
+        /// Its mean over the training scenes.
+        mean: f32,
+        /// Its standard deviation over the training scenes.
+        std: f32,
     },
     /// The network's output is not a number everywhere.
     #[error(
@@ -61,9 +82,11 @@ impl Bundle {
     /// Returns planar `[3, H, W]` in linear HDR, not negative.
     ///
     /// # Errors
-    /// Buffers that do not fit the frame's size, a device that fails, an output that is not finite.
+    /// Buffers that do not fit the frame's size, a feature that is more than [`FARTHEST_MEAN`] from the training scenes,
+    /// a device that fails, an output that is not finite.
     pub fn denoise(&self, frame: &Frame) -> Result<Vec<f32>, DenoiseError> {
         let padding = padding(frame)?;
+        self.check_statistics(frame)?;
         let mut color_gamma = frame.color.clone();
         self.meta.normalizer.color_gamma_from_hdr(&mut color_gamma);
         let device = self.device();
@@ -98,6 +121,30 @@ impl Bundle {
             .detail_map(self.features_z(frame, padding))
             .map(|map| image(map, frame, padding))
             .transpose()
+    }
+
+    /// Refuses a frame with a channel whose mean is [`FARTHEST_MEAN`] deviations from the training scenes' or more.
+    fn check_statistics(&self, frame: &Frame) -> Result<(), DenoiseError> {
+        let stats = &self.meta.normalizer.features;
+        for (i, plane) in frame
+            .features
+            .chunks_exact(frame.width * frame.height)
+            .enumerate()
+        {
+            let found = plane.iter().map(|&x| f64::from(x)).sum::<f64>() / plane.len() as f64;
+            let (mean, std) = (stats.mean[i], stats.std[i]);
+            if (found - f64::from(mean)).abs() >= FARTHEST_MEAN * f64::from(std) {
+                let (name, channel) = (frame.name.clone(), FEATURE_NAMES[i]);
+                return Err(DenoiseError::Statistics {
+                    name,
+                    channel,
+                    found,
+                    mean,
+                    std,
+                });
+            }
+        }
+        Ok(())
     }
 
     /// Z-scored, padded features on the model's device, `[1, 12, padded H, padded W]`.
@@ -213,6 +260,24 @@ mod tests {
             .to_string();
         assert!(
             error.ends_with("features holds 191 values; 4x4 pixels need 192"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn a_scene_in_another_unit_is_refused_and_a_larger_one_is_not() {
+        let bundle = bundle(Variant::Demc);
+        let stats = &bundle.meta.normalizer.features;
+        let (mean, std) = (stats.mean[3], stats.std[3]);
+        let mut frame = frame(8, 8);
+        let mut at = |deviations: f32| {
+            frame.features[3 * 64..4 * 64].fill(mean + deviations * std);
+            bundle.denoise(&frame)
+        };
+        assert!(at(100.0).is_ok());
+        let error = at(-2000.0).expect_err("millimetres").to_string();
+        assert!(
+            error.contains("position.x does not fit the model's statistics"),
             "{error}"
         );
     }

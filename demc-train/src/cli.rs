@@ -8,6 +8,7 @@ use demc_train::checkpoint;
 use demc_train::config::Config;
 use demc_train::data::Data;
 use demc_train::estimate::Estimate;
+use demc_train::progress::say;
 use demc_train::run_dir::RunDir;
 use demc_train::train::Run;
 
@@ -76,35 +77,45 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         .map_or(0, |checkpoint| checkpoint.state.step);
     let estimate = Estimate::measure(&config, &data, first, &device.clone().autodiff());
     let run_path = dir.path().to_owned();
-    println!(
+    say(format!(
         "demc-train: {estimate} for steps {first} to {} on {}",
         config.train.steps, arguments.device
-    );
-    println!("\n{}", config.to_toml());
-    println!("data: {} in {}", data.summary(), config.data.root.display());
+    ));
+    say(format!("\n{}", config.to_toml()));
+    say(format!(
+        "data: {} in {}",
+        data.summary(),
+        config.data.root.display()
+    ));
     if data.clamped > 0 {
-        println!(
+        say(format!(
             "data: {} negative values of radiance count as 0",
             data.clamped
-        );
+        ));
     }
     let mut run = Run::new(config, data, dir, checkpoint, &device)?;
-    println!("network: {} trainable parameters", run.parameters());
-    println!(
+    say(format!(
+        "network: {} trainable parameters",
+        run.parameters()
+    ));
+    say(format!(
         "patches: {} an epoch, {} a step",
         run.patches(),
         run.patches_per_step()
-    );
+    ));
     if arguments.check {
-        println!("check: all is well; nothing was written");
+        say("check: all is well; nothing was written");
         return Ok(());
     }
-    println!("run: {}\n", run_path.display());
+    say(format!("run: {}\n", run_path.display()));
     run.train(&arguments.device)?;
     match run.test(&device)? {
-        Some((step, report)) => println!("\nTest split, weights of step {step}:\n\n{report}"),
-        None => println!("\nThe data set has no test split: nothing to score."),
+        Some((step, report)) => say(format!("\nTest split, weights of step {step}:\n\n{report}")),
+        None => say("\nThe data set has no test split: nothing to score."),
     }
-    println!("\nweights, pictures and scores: {}", run_path.display());
+    say(format!(
+        "\nweights, pictures and scores: {}",
+        run_path.display()
+    ));
     Ok(())
 }

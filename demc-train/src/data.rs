@@ -1,7 +1,9 @@
 //! The data of a run: the scenes of each split and the statistics of those that are trained on.
 
 use anyhow::Context;
-use demc_data::{ChannelLayout, DataConfig, Dataset, Normalizer, Scene, Split, Statistics};
+use demc_data::{
+    ChannelLayout, DataConfig, Dataset, Normalizer, Scene, Split, Statistics, read_frame,
+};
 
 /// A data set, opened, split and measured.
 #[derive(Debug)]
@@ -21,7 +23,8 @@ pub struct Data {
 }
 
 impl Data {
-    /// Opens the data set that `config` names; `seed` draws the validation scenes.
+    /// Opens the data set that `config` names and reads every scene once, so that a bad one is found before the first
+    /// step; `seed` draws the validation scenes.
     ///
     /// # Errors
     /// A layout, manifest or image that cannot be used, or a training split without scenes.
@@ -29,7 +32,7 @@ impl Data {
         let layout = ChannelLayout::resolve(&config.layout)?;
         let dataset = Dataset::open(&config.root, &layout)?;
         let (train, validation) = dataset.train_validation(config.validation, seed)?;
-        let test = dataset
+        let test: Vec<Scene> = dataset
             .scenes
             .iter()
             .filter(|scene| scene.split == Split::Test)
@@ -37,13 +40,18 @@ impl Data {
             .collect();
         let statistics = Statistics::measure(&train, &layout, config.gamma)
             .context("measuring the training scenes")?;
+        let mut clamped = statistics.clamped;
+        for scene in validation.iter().chain(&test) {
+            // Now, not when a run of days comes to its table.
+            clamped += read_frame(&scene.path, &layout)?.clamped as u64;
+        }
         Ok(Data {
             layout,
             train,
             validation,
             test,
             normalizer: statistics.normalizer,
-            clamped: statistics.clamped,
+            clamped,
         })
     }
 

@@ -1,6 +1,7 @@
 //! Progress of a training on stderr, and lines on stdout that the bar does not overwrite.
 
 use std::fmt::Display;
+use std::io::{Write, stdout};
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -46,11 +47,16 @@ impl Progress {
 
     /// A line on stdout.
     pub fn line(&self, line: impl Display) {
-        self.bar.suspend(|| println!("{line}"));
+        self.bar.suspend(|| say(line));
     }
 
     /// Takes the bar away.
     pub fn finish(&self) {
         self.bar.finish_and_clear();
     }
+}
+
+/// Prints a line on stdout. Whether anybody still listens (`| head`) is no concern of a training.
+pub fn say(line: impl Display) {
+    let _ = writeln!(stdout(), "{line}");
 }
