@@ -5,18 +5,16 @@ mod cli;
 use std::process::ExitCode;
 
 use clap::Parser;
+use demc_infer::device::DeviceError;
+use demc_train::config::ConfigError;
 
 fn main() -> ExitCode {
     match cli::run(cli::Arguments::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            // A bad configuration is a matter of usage, anything else of the run.
-            if error.is::<demc_train::config::ConfigError>() {
-                ExitCode::from(2)
-            } else {
-                ExitCode::FAILURE
-            }
+            let usage = error.is::<ConfigError>() || error.is::<DeviceError>();
+            ExitCode::from(if usage { 2 } else { 1 })
         }
     }
 }

@@ -25,6 +25,8 @@ use crate::data::Data;
 const CONFIG: &str = "config.toml";
 /// What the run was made of.
 const RUN: &str = "run.json";
+/// Version of Burn, for the record; Burn itself does not tell.
+const BURN: &str = "0.22.1";
 /// The log.
 const METRICS: &str = "metrics.jsonl";
 
@@ -137,7 +139,7 @@ impl RunDir {
         }
         let written = Record {
             demc: env!("CARGO_PKG_VERSION").to_string(),
-            burn: "0.22.1".to_string(),
+            burn: BURN.to_string(),
             device: facts.device.to_string(),
             parameters: facts.parameters,
             patches: facts.patches,
@@ -277,6 +279,14 @@ mod tests {
         let cut = fs::read_to_string(&path).unwrap();
         assert_eq!(cut.lines().count(), 2);
         assert!(whole.starts_with(&cut));
+    }
+
+    #[test]
+    fn recorded_version_of_burn_is_the_pinned_one() {
+        let manifest = concat!(env!("CARGO_MANIFEST_DIR"), "/../Cargo.toml");
+        let manifest: toml::Table = fs::read_to_string(manifest).unwrap().parse().unwrap();
+        let burn = &manifest["workspace"]["dependencies"]["burn"]["version"];
+        assert_eq!(burn.as_str(), Some(format!("={BURN}").as_str()));
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use demc_data::{Frame, Scene, read_frame};
+use demc_data::{Scene, read_frame};
 use demc_infer::Bundle;
 use demc_infer::evaluate::{ImageScore, Report};
 use demc_infer::picture::Picture;
@@ -30,29 +30,12 @@ pub fn score(
             ..ImageScore::new(&frame, &denoised, scene.ref_residual_relmse)?
         });
         if index < strips {
-            rows.push(strip(bundle, &frame, &denoised)?);
+            let detail_map = bundle.detail_map(&frame)?;
+            rows.push(Picture::strip(&frame, detail_map.as_deref(), &denoised));
         }
     }
     let picture = (!rows.is_empty()).then(|| Picture::above(&rows));
     Ok((Report::new(scores), picture))
-}
-
-/// `noisy | detail map | denoised | reference`; without detail map where the network has none.
-fn strip(bundle: &Bundle, frame: &Frame, denoised: &[f32]) -> anyhow::Result<Picture> {
-    let (height, width) = (frame.height, frame.width);
-    let hdr = |planes: &[f32]| Picture::from_hdr(planes, height, width);
-    let detail_map = bundle
-        .detail_map(frame)?
-        .map(|planes| Picture::from_detail_map(&planes, height, width));
-    let pictures = [
-        Some(hdr(&frame.color)),
-        detail_map,
-        Some(hdr(denoised)),
-        frame.reference.as_deref().map(hdr),
-    ];
-    Ok(Picture::beside(
-        &pictures.into_iter().flatten().collect::<Vec<_>>(),
-    ))
 }
 
 /// Writes a picture into the run directory.

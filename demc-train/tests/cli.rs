@@ -135,7 +135,8 @@ fn bad_worlds_exit_with_1_and_one_line() {
     let config = config(dir.path());
     let run = dir.path().join("run");
     let error = |args: &[&str]| error_line(&train(&config, &run, args), 1);
-    assert!(error(&["--device", "tpu"]).contains("known devices: flex"));
+    let device = error_line(&train(&config, &run, &["--device", "tpu"]), 2);
+    assert!(device.contains("known devices: flex"), "{device}");
     assert!(error(&["--set", "data.root=/nowhere/at/all"]).contains("/nowhere/at/all"));
     assert!(error(&["--set", "data.layout=blender"]).contains("blender"));
     assert!(
