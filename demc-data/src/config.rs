@@ -30,6 +30,12 @@ const WORKERS: usize = 1;
 
 /// The network halves its input five times: patches are multiples of this (Fig. 3).
 const PATCH_MULTIPLE: usize = 32;
+/// A longer side is a mistake: the paper's scenes are 1280x720.
+const MAX_PATCH_SIZE: usize = 4096;
+/// More patches than this are a mistake: at the paper's patch size their features are 52 GB.
+const MAX_BATCH_SIZE: usize = 65536;
+/// 16 TiB: more is a mistake, and in bytes it could be too large for a `usize`.
+const MAX_CACHE_MIB: usize = 1 << 24;
 /// More threads than this are a mistake.
 const MAX_WORKERS: usize = 64;
 
@@ -41,7 +47,7 @@ pub struct DataConfig {
     pub root: PathBuf,
     /// Channel layout: a preset or a TOML file ([`crate::ChannelLayout::resolve`]).
     pub layout: String,
-    /// Side of a patch in pixels, a multiple of 32.
+    /// Side of a patch in pixels, a multiple of 32 up to 4096.
     pub patch_size: usize,
     /// Distance between patches in pixels.
     pub stride: usize,
@@ -49,13 +55,13 @@ pub struct DataConfig {
     pub border: Border,
     /// The transfer function's exponent is `1 / gamma` (Eq. 4).
     pub gamma: f32,
-    /// Patches in a batch.
+    /// Patches in a batch, at most 65536.
     pub batch_size: usize,
     /// Share of the training split's base scenes that is held out for validation, 0 to below 1.
     pub validation: f64,
     /// Flips and transposes: `true`, `false` or a list of `"flip"` and `"transpose"`.
     pub augment: Augment,
-    /// Memory for decoded scenes, in MiB.
+    /// Memory for decoded scenes, in MiB, at most 2^24.
     pub cache_mib: usize,
     /// Threads that decode and cut batches; the batches do not depend on it.
     pub workers: usize,
@@ -89,12 +95,12 @@ impl DataConfig {
                 problems.push(format!("data.{key} = {value:?}: must be {allowed}"));
             }
         };
-        let multiple = self.patch_size > 0 && self.patch_size.is_multiple_of(PATCH_MULTIPLE);
         require(
-            multiple,
+            (PATCH_MULTIPLE..=MAX_PATCH_SIZE).contains(&self.patch_size)
+                && self.patch_size.is_multiple_of(PATCH_MULTIPLE),
             "patch_size",
             &self.patch_size,
-            "a positive multiple of 32",
+            "a positive multiple of 32, at most 4096",
         );
         require(self.stride > 0, "stride", &self.stride, "at least 1");
         require(
@@ -104,16 +110,22 @@ impl DataConfig {
             "a positive number",
         );
         require(
-            self.batch_size > 0,
+            (1..=MAX_BATCH_SIZE).contains(&self.batch_size),
             "batch_size",
             &self.batch_size,
-            "at least 1",
+            "from 1 to 65536",
         );
         require(
             (0.0..1.0).contains(&self.validation),
             "validation",
             &self.validation,
             "from 0 to below 1",
+        );
+        require(
+            self.cache_mib <= MAX_CACHE_MIB,
+            "cache_mib",
+            &self.cache_mib,
+            "at most 16777216 (16 TiB)",
         );
         require(
             (1..=MAX_WORKERS).contains(&self.workers),
@@ -160,8 +172,21 @@ mod tests {
         assert_eq!(problems.len(), 6, "{problems:?}");
         assert_eq!(
             problems[0],
-            "data.patch_size = 100: must be a positive multiple of 32"
+            "data.patch_size = 100: must be a positive multiple of 32, at most 4096"
         );
+    }
+
+    #[test]
+    fn upper_bounds_hold_and_are_allowed_themselves() {
+        let sized = |more: usize| DataConfig {
+            patch_size: MAX_PATCH_SIZE + 32 * more,
+            batch_size: MAX_BATCH_SIZE + more,
+            cache_mib: MAX_CACHE_MIB + more,
+            ..DataConfig::default()
+        };
+        assert_eq!(sized(0).validate(), Vec::<String>::new());
+        let problems = sized(1).validate();
+        assert_eq!(problems.len(), 3, "{problems:?}");
     }
 
     #[test]

@@ -107,11 +107,7 @@ impl Dataset {
                 "the layout names no reference, and nothing can be learnt without one".to_owned(),
             );
         }
-        problems.extend(
-            scenes
-                .iter()
-                .filter_map(|scene| file_problem(scene, layout)),
-        );
+        problems.extend(file_problems(&scenes, layout));
         match problems.is_empty() {
             true => Ok(Self {
                 root: root.to_owned(),
@@ -216,15 +212,38 @@ fn manifest_problems(scenes: &[Scene]) -> Vec<String> {
     problems
 }
 
-fn file_problem(scene: &Scene, layout: &ChannelLayout) -> Option<String> {
-    match check_header(&scene.path, layout, Presence::Required) {
-        Ok(window) => {
-            size_mismatch(scene, window.width, window.height).map(|error| error.to_string())
+/// What is wrong with the scenes' files. Channels that many of them lack are one problem, named with the first.
+fn file_problems(scenes: &[Scene], layout: &ChannelLayout) -> Vec<String> {
+    let mut problems: Vec<(Error, usize)> = Vec::new();
+    for error in scenes.iter().filter_map(|scene| file_error(scene, layout)) {
+        let same = problems.iter_mut().find(|(known, _)| {
+            let lacking = missing_channels(known);
+            lacking.is_some() && lacking == missing_channels(&error)
+        });
+        match same {
+            Some((_, more)) => *more += 1,
+            None => problems.push((error, 0)),
         }
-        Err(error) => Some(match std::error::Error::source(&error) {
-            Some(source) => format!("{error}: {source}"),
-            None => error.to_string(),
-        }),
+    }
+    let phrase = |(error, more): &(Error, usize)| match (std::error::Error::source(error), more) {
+        (Some(source), _) => format!("{error}: {source}"),
+        (None, 0) => error.to_string(),
+        (None, more) => format!("{error} (and so in {more} more scenes)"),
+    };
+    problems.iter().map(phrase).collect()
+}
+
+fn missing_channels(error: &Error) -> Option<&[String]> {
+    match error {
+        Error::MissingChannels { missing, .. } => Some(missing),
+        _ => None,
+    }
+}
+
+fn file_error(scene: &Scene, layout: &ChannelLayout) -> Option<Error> {
+    match check_header(&scene.path, layout, Presence::Required) {
+        Ok(window) => size_mismatch(scene, window.width, window.height),
+        Err(error) => Some(error),
     }
 }
 

@@ -120,13 +120,15 @@ impl ExrFile {
     /// Checks that the file has all these channels.
     ///
     /// # Errors
-    /// [`Error::MissingChannels`], naming those that it lacks and those that it has.
+    /// [`Error::MissingChannels`], naming those that it lacks, each once, and those that it has.
     pub fn require(&self, names: &[&str]) -> Result<(), Error> {
-        let missing: Vec<String> = names
-            .iter()
-            .filter(|name| self.channel(name).is_none())
-            .map(ToString::to_string)
-            .collect();
+        let mut missing: Vec<String> = Vec::new();
+        for name in names.iter().filter(|name| self.channel(name).is_none()) {
+            // A texture that stands in for another is asked for twice.
+            if !missing.iter().any(|known| known == name) {
+                missing.push((*name).to_owned());
+            }
+        }
         if missing.is_empty() {
             return Ok(());
         }

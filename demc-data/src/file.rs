@@ -7,10 +7,12 @@ use std::path::{Path, PathBuf};
 use crate::Error;
 
 /// Writes `path` through `fill`: to a temporary name in the same directory, flushed to the disk, mode 0644,
-/// then renamed. Whoever looks at `path` sees the old file or the new one, never a part.
+/// then renamed. Whoever looks at `path` sees the old file or the new one, never a part. A symbolic link
+/// stays: the file that it leads to is replaced.
 ///
 /// # Errors
-/// [`Error::Write`], naming `path`; the temporary file is removed.
+/// [`Error::Write`], naming `path`; the temporary file is removed. Its source is of the kind
+/// [`io::ErrorKind::InvalidInput`] if a device, a FIFO or a directory is in the way, which is left alone.
 pub fn write_whole(
     path: &Path,
     fill: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
@@ -19,8 +21,9 @@ pub fn write_whole(
         path: path.to_owned(),
         source,
     };
-    let temporary = temporary_beside(path).map_err(error)?;
-    fill_and_rename(&temporary, path, fill).map_err(|source| {
+    let target = target_of(path).map_err(error)?;
+    let temporary = temporary_beside(&target).map_err(error)?;
+    fill_and_rename(&temporary, &target, fill).map_err(|source| {
         // The first error is the one to report: there may be nothing to remove.
         let _ = fs::remove_file(&temporary);
         error(source)
@@ -40,6 +43,23 @@ fn fill_and_rename(
     file.set_permissions(std::os::unix::fs::PermissionsExt::from_mode(0o644))?;
     file.sync_all()?;
     fs::rename(temporary, path)
+}
+
+/// The file that `path` stands for: itself, or what a symbolic link leads to. A rename would replace a link,
+/// a FIFO, or the device `/dev/null`, by a file.
+fn target_of(path: &Path) -> io::Result<PathBuf> {
+    let refused = |why: &str| Err(io::Error::new(io::ErrorKind::InvalidInput, why));
+    match fs::symlink_metadata(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(path.to_owned()),
+        found => found?,
+    };
+    match fs::canonicalize(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {
+            refused("a symbolic link that leads nowhere")
+        }
+        Ok(target) if !fs::metadata(&target)?.is_file() => refused("not a regular file"),
+        target => target,
+    }
 }
 
 /// `DIR/.NAME.PID.tmp` for `DIR/NAME`: hidden, and two processes do not meet in it.

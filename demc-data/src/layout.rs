@@ -240,6 +240,19 @@ mod tests {
     }
 
     #[test]
+    fn every_preset_can_be_trained_with() {
+        for (name, _) in PRESETS {
+            let layout = ChannelLayout::resolve(name).expect(name);
+            assert_eq!(
+                layout.reference.expect(name),
+                ["ref.R", "ref.G", "ref.B"],
+                "{name}"
+            );
+            assert_eq!(layout.mask.is_some(), name == "demc-exr", "{name}");
+        }
+    }
+
+    #[test]
     fn an_unknown_name_lists_the_presets() {
         let error = ChannelLayout::resolve("maya")
             .expect_err("no such preset")

@@ -8,9 +8,9 @@ use clap::Parser;
 
 fn main() -> ExitCode {
     match cli::Cli::parse().run() {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(status) => status,
         Err(error) => {
-            eprintln!("error: {error:#}");
+            cli::report(&error);
             ExitCode::FAILURE
         }
     }

@@ -157,6 +157,24 @@ fn bad_files_end_with_status_1_and_one_line() {
 }
 
 #[test]
+fn inspect_reports_a_bad_file_and_goes_on() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let (bad, good) = (dir.path().join("bad.exr"), dir.path().join("good.exr"));
+    fs::write(&bad, "text").expect("writable");
+    write(&good, (1, 1), named([("R", half([1.0]))]));
+    let [bad, good] = [&bad, &good].map(|path| path.to_str().expect("a readable path"));
+    for options in [vec!["inspect"], vec!["inspect", "--json"]] {
+        let args = [options, vec![bad, good]].concat();
+        let message = refusal(&args, 1);
+        assert_eq!(message.lines().count(), 1, "{message}");
+        assert!(message.contains("bad.exr: not a readable"), "{message}");
+        let shown = String::from_utf8(demc_data(&args).stdout).expect("text");
+        assert!(shown.contains("good.exr"), "{shown}");
+        assert!(!shown.contains("bad.exr"), "{shown}");
+    }
+}
+
+#[test]
 fn wrong_arguments_end_with_status_2() {
     refusal(&["inspect"], 2);
     refusal(&["stats", "x", "--split", "valid"], 2);

@@ -7,7 +7,7 @@ use std::fs;
 use std::path::Path;
 
 use demc_data::transform::STD_FLOOR;
-use demc_data::{Dataset, Error, Scene, Split, Statistics, read_frame};
+use demc_data::{ChannelLayout, Dataset, Error, Scene, Split, Statistics, read_frame};
 use serde_json::{Value, json};
 use support::{half, layout, sample, scene_channels, write};
 
@@ -149,6 +149,51 @@ fn every_problem_of_a_manifest_is_named_at_once() {
         assert!(message.contains(part), "{part:?} is not in: {message}");
     }
     assert!(refusal(vec![]).contains("lists no scenes"));
+}
+
+#[test]
+fn channels_that_many_scenes_lack_are_listed_once() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let scene = |i: usize| entry(&format!("s{i}"), "train", "b");
+    dataset(dir.path(), (0..10).map(scene).collect()).expect("sound");
+    let layout = ChannelLayout::resolve("mitsuba3").expect("a preset");
+    let message = Dataset::open(dir.path(), &layout)
+        .expect_err("its texture is albedo1")
+        .to_string();
+    assert_eq!(message.matches("the file has").count(), 1, "{message}");
+    assert!(message.ends_with("(and so in 9 more scenes)"), "{message}");
+}
+
+#[test]
+fn a_set_without_masks_is_measured_over_every_pixel() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let layout = ChannelLayout::resolve("mitsuba3").expect("a preset");
+    dataset(dir.path(), vec![entry("a", "train", "a")]).expect("sound");
+    let mut channels = scene_channels(8, 6);
+    channels.retain(|(name, _)| !name.starts_with("albedo2.") && name != "mask.A");
+    for (name, _) in &mut channels {
+        *name = name.replace("albedo1.", "albedo.");
+    }
+    write(&dir.path().join("a.exr"), (8, 6), channels.clone());
+    let set = Dataset::open(dir.path(), &layout).expect("all that training needs");
+    let stats = Statistics::measure(&set.scenes, &layout, 2.2).expect("sound");
+    assert_eq!((stats.pixels, stats.misses), (48, 0));
+    // Position is channel 6 of the file, stored as float: 6 + i / 48 at pixel i.
+    let mean = stats.normalizer.features.mean;
+    assert!((mean[3] - (6.0 + 23.5 / 48.0)).abs() < 1e-5, "{mean:?}");
+    assert_eq!(mean[6..9], mean[9..]);
+    // To denoise, no reference is needed; to train, it is.
+    channels.retain(|(name, _)| !name.starts_with("ref."));
+    write(&dir.path().join("a.exr"), (8, 6), channels);
+    let frame = read_frame(&dir.path().join("a.exr"), &layout).expect("features are there");
+    assert_eq!((frame.reference, frame.mask), (None, None));
+    let message = Dataset::open(dir.path(), &layout)
+        .expect_err("no reference")
+        .to_string();
+    assert!(
+        message.contains("no channel ref.R, ref.G, ref.B"),
+        "{message}"
+    );
 }
 
 #[test]

@@ -128,6 +128,22 @@ fn missing_channels_are_named_with_those_present() {
 }
 
 #[test]
+fn a_missing_channel_that_is_asked_for_twice_is_named_once() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let path = dir.path().join("a.exr");
+    // Its texture is the second one's too.
+    let layout = ChannelLayout::resolve("mitsuba3").expect("a preset");
+    write(&path, SIZE, scene_channels(SIZE.0, SIZE.1));
+    let message = read_frame(&path, &layout)
+        .expect_err("it has albedo1")
+        .to_string();
+    assert!(
+        message.contains("no channel albedo.R, albedo.G, albedo.B; the file has"),
+        "{message}"
+    );
+}
+
+#[test]
 fn buffers_of_different_sizes_are_refused() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let path = dir.path().join("a.exr");

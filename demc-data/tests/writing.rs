@@ -5,7 +5,7 @@ use std::path::Path;
 
 use demc_data::exr::ExrFile;
 use demc_data::plane::Plane;
-use demc_data::{Precision, write_rgb};
+use demc_data::{Error, Precision, write_rgb};
 
 const SIZE: (usize, usize) = (7, 5);
 const PIXELS: usize = 35;
@@ -86,4 +86,48 @@ fn an_output_that_cannot_be_written_is_named_and_leaves_nothing() {
         1,
         "no temporary file is left"
     );
+}
+
+#[cfg(unix)]
+#[test]
+fn a_link_stays_and_the_file_it_leads_to_is_replaced() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let (file, link) = (dir.path().join("out.exr"), dir.path().join("latest.exr"));
+    fs::write(&file, "old").expect("writable");
+    std::os::unix::fs::symlink("out.exr", &link).expect("writable");
+    write_rgb(&link, 1, 1, &[1.0; 3], Precision::Half).expect("writable through the link");
+    assert!(link.is_symlink() && !file.is_symlink());
+    ExrFile::open(&file).expect("just written");
+    fs::remove_file(&file).expect("it is there");
+    let error = write_rgb(&link, 1, 1, &[1.0; 3], Precision::Half).expect_err("a link to nothing");
+    assert!(link.is_symlink(), "{error}");
+}
+
+#[cfg(unix)]
+#[test]
+fn what_is_not_a_regular_file_is_refused_and_left_alone() {
+    use std::os::unix::fs::{FileTypeExt, symlink};
+    // A FIFO stands in for a device: a test must not touch real ones.
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let (fifo, link) = (dir.path().join("fifo"), dir.path().join("link"));
+    let made = std::process::Command::new("mkfifo").arg(&fifo).status();
+    assert!(made.expect("mkfifo is there").success());
+    symlink(&fifo, &link).expect("writable");
+    for path in [&fifo, &link, &dir.path().to_owned()] {
+        let error = write_rgb(path, 1, 1, &[1.0; 3], Precision::Half).expect_err("no file");
+        assert_eq!(
+            error.to_string(),
+            format!("cannot write {}", path.display())
+        );
+        let Error::Write { source, .. } = error else {
+            panic!("{error:?}");
+        };
+        assert_eq!(source.kind(), std::io::ErrorKind::InvalidInput);
+        assert_eq!(source.to_string(), "not a regular file");
+    }
+    let kind = fs::symlink_metadata(&fifo)
+        .expect("still there")
+        .file_type();
+    assert!(kind.is_fifo() && link.is_symlink());
+    assert_eq!(fs::read_dir(dir.path()).expect("readable").count(), 2);
 }

@@ -23,8 +23,9 @@ pub const FEATURE_CHANNELS: usize = 12;
 /// Channels of the detail map that the fusion sub-network makes of the features (Sec. 3.2).
 pub const DETAIL_CHANNELS: usize = 3;
 
-/// Widest base width that a configuration may ask for; ours, to refuse a slip of the keyboard before memory does.
-pub const MAX_WIDTH: usize = 1024;
+/// Widest base width that a configuration may ask for. Ours: 256 has 686 million parameters, 11 GB with Adam's state and
+/// gradients; more is a slip of the keyboard.
+pub const MAX_WIDTH: usize = 256;
 
 /// Which network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -202,7 +203,9 @@ impl ModelConfig {
     pub fn validate(&self) -> Vec<String> {
         match self.width {
             1..=MAX_WIDTH => Vec::new(),
-            width => vec![format!("model.width: {width} is not in 1..={MAX_WIDTH}")],
+            width => vec![format!(
+                "model.width = {width}: must be from 1 to {MAX_WIDTH}"
+            )],
         }
     }
 }

@@ -12,7 +12,7 @@
 use std::collections::HashMap;
 use std::fs;
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, bail, ensure};
 use burn::tensor::Device;
@@ -117,7 +117,7 @@ pub fn save(
         return Err(error.context("writing a checkpoint"));
     }
     write_whole(&run.join(LATEST), |file| writeln!(file, "{name}"))?;
-    prune(&all, keep)
+    prune(&all, &name, keep)
 }
 
 fn write_files(dir: &Path, bundle: &Bundle, adam: &Adam, state: &State) -> anyhow::Result<()> {
@@ -142,9 +142,18 @@ pub fn load_latest(
 ) -> anyhow::Result<Option<Checkpoint>> {
     let latest = run.join(LATEST);
     if !latest.exists() {
+        let all = run.join(CHECKPOINTS);
+        let empty = fs::read_dir(&all).map_or(true, |mut entries| entries.next().is_none());
+        ensure!(
+            empty,
+            "{}: missing, but there are checkpoints in {}; write the name of one into it",
+            latest.display(),
+            all.display()
+        );
         return Ok(None);
     }
     let name = fs::read_to_string(&latest).with_context(|| latest.display().to_string())?;
+    ensure!(!name.trim().is_empty(), "{}: empty", latest.display());
     let dir = run.join(CHECKPOINTS).join(name.trim());
     load(&dir, adam_epsilon, device)
         .with_context(|| format!("checkpoint {}", dir.display()))
@@ -244,21 +253,75 @@ fn moments_from(bytes: &[u8]) -> anyhow::Result<Vec<Weight>> {
     moments.collect()
 }
 
-/// Removes all finished checkpoints but the newest `keep`, and what unfinished ones left behind.
-fn prune(all: &Path, keep: usize) -> anyhow::Result<()> {
+/// Removes all checkpoints but `name` and the newest others, `keep` in all, and what unfinished ones left behind. What is
+/// not named like a checkpoint is not ours.
+fn prune(all: &Path, name: &str, keep: usize) -> anyhow::Result<()> {
     let entries = fs::read_dir(all).with_context(|| all.display().to_string())?;
-    let mut names: Vec<PathBuf> = entries
-        .map(|entry| Ok(entry?.path()))
-        .collect::<std::io::Result<_>>()?;
-    let unfinished = |path: &PathBuf| path.to_string_lossy().ends_with(UNFINISHED);
-    names.sort_by_key(|path| (!unfinished(path), path.clone()));
-    let old = names.len().saturating_sub(keep);
-    names[..old].iter().try_for_each(|path| remove(path))
+    let mut old = Vec::new();
+    for entry in entries {
+        let entry = entry
+            .with_context(|| all.display().to_string())?
+            .file_name();
+        let entry = entry.to_string_lossy().into_owned();
+        let finished = entry.strip_suffix(UNFINISHED).unwrap_or(&entry);
+        let step = finished.strip_prefix("step-").unwrap_or_default();
+        if step.len() >= 8 && step.bytes().all(|b| b.is_ascii_digit()) && entry != name {
+            old.push((finished == entry, entry));
+        }
+    }
+    // Unfinished ones first, then by step.
+    old.sort();
+    let finished = old.iter().filter(|(finished, _)| *finished).count();
+    let removed = old.len() - finished.min(keep - 1);
+    old[..removed]
+        .iter()
+        .try_for_each(|(_, entry)| remove(&all.join(entry)))
 }
 
 fn remove(dir: &Path) -> anyhow::Result<()> {
     match dir.exists() {
         true => fs::remove_dir_all(dir).with_context(|| dir.display().to_string()),
         false => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_old_checkpoints_are_pruned() {
+        let dir = tempfile::tempdir().unwrap();
+        let all = dir.path();
+        for name in [
+            "step-00000001",
+            "step-00000002",
+            "step-00000003.tmp",
+            "step-00000009",
+            "keep-me",
+        ] {
+            fs::create_dir(all.join(name)).unwrap();
+        }
+        fs::write(all.join("notes.txt"), "mine").unwrap();
+        prune(all, "step-00000002", 2).unwrap();
+        let mut left: Vec<_> = fs::read_dir(all)
+            .unwrap()
+            .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+            .collect();
+        left.sort();
+        assert_eq!(
+            left,
+            ["keep-me", "notes.txt", "step-00000002", "step-00000009"]
+        );
+    }
+
+    #[test]
+    fn lost_latest_is_an_error_and_no_run_is_none() {
+        let dir = tempfile::tempdir().unwrap();
+        let load = || load_latest(dir.path(), 1e-8, &Device::flex().autodiff());
+        assert!(load().unwrap().is_none());
+        fs::create_dir_all(dir.path().join("checkpoints/step-00000001")).unwrap();
+        let error = load().err().unwrap().to_string();
+        assert!(error.contains("latest: missing"), "{error}");
     }
 }

@@ -75,6 +75,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
     let first = checkpoint
         .as_ref()
         .map_or(0, |checkpoint| checkpoint.state.step);
+    let nothing = arguments.resume && checkpoint.is_none();
     let estimate = Estimate::measure(&config, &data, first, &device.clone().autodiff());
     let run_path = dir.path().to_owned();
     say(format!(
@@ -91,6 +92,12 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         say(format!(
             "data: {} negative values of radiance count as 0",
             data.clamped
+        ));
+    }
+    if nothing {
+        say(format!(
+            "note: no checkpoint in {}: starting at step 0",
+            dir.path().display()
         ));
     }
     let mut run = Run::new(config, data, dir, checkpoint, &device)?;

@@ -2,7 +2,7 @@
 
 use std::convert::Infallible;
 use std::fmt;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use burn::tensor::Device;
 use demc_data::{Batch, FEATURES};
@@ -18,12 +18,12 @@ const FORWARD_SHARE: f64 = 0.3;
 /// A run's duration, roughly.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Estimate {
-    /// One step.
-    pub step: Duration,
-    /// One validation.
-    pub validation: Duration,
-    /// The steps and validations that are left.
-    pub left: Duration,
+    /// One step, seconds.
+    pub step: f64,
+    /// One validation, seconds.
+    pub validation: f64,
+    /// The steps and validations that are left, seconds.
+    pub left: f64,
 }
 
 impl Estimate {
@@ -37,20 +37,19 @@ impl Estimate {
         let mut time = || {
             let started = Instant::now();
             let Ok(_) = trainer.step(0.0, || Ok::<_, Infallible>(patch.clone()));
-            started.elapsed()
+            started.elapsed().as_secs_f64()
         };
-        let patch_time = time().min(time());
+        let patch_time = f64::min(time(), time());
         let pixels: usize = data
             .validation
             .iter()
             .map(|scene| scene.width * scene.height)
             .sum();
         let patches = pixels as f64 / (config.data.patch_size * config.data.patch_size) as f64;
-        let step = patch_time.mul_f64(config.patches_per_step() as f64);
-        let validation = patch_time.mul_f64(patches * FORWARD_SHARE);
-        let steps = config.train.steps.saturating_sub(first);
-        let validations = steps as f64 / config.run.validate_every as f64;
-        let left = step.mul_f64(steps as f64) + validation.mul_f64(validations);
+        let step = patch_time * config.patches_per_step() as f64;
+        let validation = patch_time * patches * FORWARD_SHARE;
+        let steps = config.train.steps.saturating_sub(first) as f64;
+        let left = steps * (step + validation / config.run.validate_every as f64);
         Estimate {
             step,
             validation,
@@ -82,11 +81,11 @@ impl fmt::Display for Estimate {
 }
 
 /// `3 days 4 h`, `2 h 5 min`, `3 min 20 s`, `4.2 s`: two units at most.
-fn human(duration: Duration) -> String {
-    let seconds = duration.as_secs();
+fn human(duration: f64) -> String {
+    let seconds = duration as u64;
     let (days, hours, minutes) = (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60);
     match (days, hours, minutes) {
-        (0, 0, 0) => format!("{:.1} s", duration.as_secs_f64()),
+        (0, 0, 0) => format!("{duration:.1} s"),
         (0, 0, _) => format!("{minutes} min {} s", seconds % 60),
         (0, _, _) => format!("{hours} h {minutes} min"),
         _ => format!("{days} days {hours} h"),
@@ -99,7 +98,6 @@ mod tests {
 
     #[test]
     fn durations_have_two_units_at_most() {
-        let human = |seconds| human(Duration::from_secs_f64(seconds));
         assert_eq!(human(4.24), "4.2 s");
         assert_eq!(human(200.0), "3 min 20 s");
         assert_eq!(human(7500.0), "2 h 5 min");

@@ -9,6 +9,7 @@ pub mod checkpoint;
 pub mod config;
 pub mod data;
 pub mod estimate;
+pub mod metrics_log;
 pub mod optimizer;
 pub mod progress;
 pub mod run_dir;

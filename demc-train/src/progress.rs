@@ -18,8 +18,9 @@ pub struct Progress {
 impl Progress {
     /// A bar that stands at step `first` of `steps`.
     pub fn new(first: u64, steps: u64, patches_per_step: u64, patches_per_epoch: usize) -> Self {
-        let style = ProgressStyle::with_template("{bar:24} step {pos}/{len}  {msg}  {eta} left")
-            .expect("a constant template");
+        let style =
+            ProgressStyle::with_template("{bar:16} step {pos}/{len}  {eta} left  {wide_msg}")
+                .expect("a constant template");
         let bar = ProgressBar::new(steps)
             .with_style(style)
             .with_position(first);

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! config.toml       the resolved configuration: `demc-train --config RUN/config.toml` repeats the run
+//! layout.toml       the channel layout, where it is not a preset
 //! run.json          versions, device, scenes of each split, statistics of the training scenes
 //! metrics.jsonl     one object a line: step, epoch, loss, lr, grad_norm, elapsed_s; on validation valid_relmse, valid_ssim
 //! latest, checkpoints/, best.safetensors
@@ -9,17 +10,18 @@
 //! test.json         scores of the test split
 //! ```
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
 use demc_data::file::write_whole;
-use demc_data::{Normalizer, Scene};
+use demc_data::{ChannelLayout, Normalizer, Scene};
 use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
 use crate::data::Data;
+use crate::metrics_log::Metrics;
 
 /// The resolved configuration.
 const CONFIG: &str = "config.toml";
@@ -29,11 +31,19 @@ const RUN: &str = "run.json";
 const BURN: &str = "0.22.1";
 /// The log.
 const METRICS: &str = "metrics.jsonl";
+/// The layout of a run that uses one of its own.
+const LAYOUT: &str = "layout.toml";
+/// Locked by the process that trains.
+const LOCK: &str = "lock";
+/// What shows that a directory holds a run.
+const TRACES: [&str; 4] = [RUN, METRICS, "checkpoints", "latest"];
 
 /// A run directory that fits the run at hand.
 #[derive(Debug)]
 pub struct RunDir {
     path: PathBuf,
+    /// Held for as long as the run writes here.
+    lock: Option<File>,
 }
 
 /// What `run.json` holds.
@@ -53,6 +63,23 @@ struct Record {
     scenes: Scenes,
     /// Gamma and the statistics of the training scenes.
     normalizer: Normalizer,
+    /// Which channels the planes were read from.
+    layout: ChannelLayout,
+}
+
+impl Record {
+    fn new(data: &Data, facts: Facts) -> Self {
+        Record {
+            demc: env!("CARGO_PKG_VERSION").to_string(),
+            burn: BURN.to_string(),
+            device: facts.device.to_string(),
+            parameters: facts.parameters,
+            patches: facts.patches,
+            scenes: Scenes::of(data),
+            normalizer: data.normalizer.clone(),
+            layout: data.layout.clone(),
+        }
+    }
 }
 
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
@@ -109,8 +136,13 @@ impl RunDir {
                     path.display()
                 );
             }
+        } else if let Some(trace) = TRACES.iter().find(|name| path.join(name).exists()) {
+            bail!(
+                "{}: holds a {trace} but no {CONFIG}: a run that lost it, or something else; take another directory",
+                path.display()
+            );
         }
-        Ok(RunDir { path })
+        Ok(RunDir { path, lock: None })
     }
 
     /// The directory.
@@ -118,39 +150,72 @@ impl RunDir {
         &self.path
     }
 
-    /// Writes configuration and record of a new run, or compares the record of one that goes on.
+    /// Locks the directory, and writes configuration and record of a new run or compares the record of one that goes on.
+    /// Returns what the user should know about the latter.
     ///
     /// # Errors
-    /// A directory that cannot be written; scenes or statistics other than those that the run began with.
-    pub fn open(&self, config: &Config, data: &Data, facts: Facts) -> anyhow::Result<()> {
-        fs::create_dir_all(&self.path).with_context(|| self.path.display().to_string())?;
+    /// A directory that cannot be written or that another process trains in; scenes, statistics or a layout other than
+    /// those that the run began with.
+    pub fn open(
+        &mut self,
+        config: &Config,
+        data: &Data,
+        facts: Facts,
+    ) -> anyhow::Result<Option<String>> {
+        let made = fs::create_dir_all(&self.path);
+        made.with_context(|| format!("cannot make {}", self.path.display()))?;
+        self.lock()?;
+        let mut saved = config.clone();
+        if config.data.layout.ends_with(".toml") {
+            let layout = toml::to_string(&data.layout)?;
+            self.write(LAYOUT, layout.as_bytes())?;
+            saved.data.layout = self.path.join(LAYOUT).to_string_lossy().into_owned();
+        }
         let record = self.path.join(RUN);
-        if record.exists() {
-            let text = fs::read_to_string(&record).with_context(|| record.display().to_string())?;
-            let began: Record =
-                serde_json::from_str(&text).with_context(|| record.display().to_string())?;
-            let same = began.normalizer == data.normalizer && began.scenes == Scenes::of(data);
+        if !record.exists() {
+            self.write(CONFIG, saved.to_toml().as_bytes())?;
+            let written = Record::new(data, facts);
+            self.write(RUN, &serde_json::to_vec_pretty(&written)?)?;
+            return Ok(None);
+        }
+        let text = fs::read_to_string(&record).with_context(|| record.display().to_string())?;
+        let began: Record =
+            serde_json::from_str(&text).with_context(|| record.display().to_string())?;
+        let now = Record::new(data, facts);
+        for (what, same) in [
+            ("scenes", began.scenes == now.scenes),
+            ("statistics", began.normalizer == now.normalizer),
+            ("channel layout", began.layout == now.layout),
+        ] {
             ensure!(
                 same,
-                "{}: the data is not what this run began with (scenes or statistics)",
+                "{}: the run began with other {what}",
                 record.display()
             );
-            return Ok(());
         }
-        let written = Record {
-            demc: env!("CARGO_PKG_VERSION").to_string(),
-            burn: BURN.to_string(),
-            device: facts.device.to_string(),
-            parameters: facts.parameters,
-            patches: facts.patches,
-            scenes: Scenes::of(data),
-            normalizer: data.normalizer.clone(),
+        let versions = |record: &Record| {
+            format!(
+                "demc {}, Burn {}, {}",
+                record.demc, record.burn, record.device
+            )
         };
-        let json = serde_json::to_vec_pretty(&written)?;
-        write_whole(&record, |file| file.write_all(&json))?;
-        write_whole(&self.path.join(CONFIG), |file| {
-            file.write_all(config.to_toml().as_bytes())
-        })?;
+        let (then, now) = (versions(&began), versions(&now));
+        Ok(
+            (then != now)
+                .then(|| format!("this run began on {then}; on {now} the bits may differ")),
+        )
+    }
+
+    fn lock(&mut self) -> anyhow::Result<()> {
+        let path = self.path.join(LOCK);
+        let file = File::create(&path).with_context(|| path.display().to_string())?;
+        if file.try_lock().is_err() {
+            bail!(
+                "{}: another process trains in this directory",
+                self.path.display()
+            );
+        }
+        self.lock = Some(file);
         Ok(())
     }
 
@@ -159,25 +224,7 @@ impl RunDir {
     /// # Errors
     /// A log that cannot be read or written.
     pub fn metrics(&self, step: u64) -> anyhow::Result<Metrics> {
-        let path = self.path.join(METRICS);
-        let text = if path.exists() {
-            fs::read_to_string(&path)
-        } else {
-            Ok(String::new())
-        };
-        let text = text.with_context(|| path.display().to_string())?;
-        let kept: String = text
-            .split_inclusive('\n')
-            .take_while(|line| is_line_until(line, step))
-            .collect();
-        if kept.len() != text.len() {
-            write_whole(&path, |file| file.write_all(kept.as_bytes()))?;
-        }
-        let file = OpenOptions::new().create(true).append(true).open(&path);
-        Ok(Metrics {
-            file: file.with_context(|| path.display().to_string())?,
-            path,
-        })
+        Metrics::open(&self.path.join(METRICS), step)
     }
 
     /// Writes a file of the run, whole or not at all.
@@ -191,95 +238,9 @@ impl RunDir {
     }
 }
 
-/// Whether `text` is a whole line of a step up to `step`.
-fn is_line_until(text: &str, step: u64) -> bool {
-    let line = text
-        .strip_suffix('\n')
-        .and_then(|line| serde_json::from_str::<serde_json::Value>(line).ok());
-    line.and_then(|line| line.get("step")?.as_u64())
-        .is_some_and(|at| at <= step)
-}
-
-/// `metrics.jsonl`, open for more.
-#[derive(Debug)]
-pub struct Metrics {
-    file: File,
-    path: PathBuf,
-}
-
-/// One line of `metrics.jsonl`. Nothing depends on the clock but `elapsed_s`.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Line {
-    /// Steps taken.
-    pub step: u64,
-    /// Passes over the training patches.
-    pub epoch: f64,
-    /// Mean training loss (Eq. 5) since the line before.
-    pub loss: f64,
-    /// Learning rate of the last step.
-    pub lr: f64,
-    /// Mean norm of the gradient since the line before, before clipping.
-    pub grad_norm: f64,
-    /// Mean RelMSE of the validation scenes.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub valid_relmse: Option<f64>,
-    /// Mean SSIM of the validation scenes.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub valid_ssim: Option<f64>,
-    /// Seconds since the start, stops left out.
-    pub elapsed_s: f64,
-}
-
-impl Metrics {
-    /// Appends a line.
-    ///
-    /// # Errors
-    /// A file that cannot be written.
-    pub fn append(&mut self, line: &Line) -> anyhow::Result<()> {
-        let mut text = serde_json::to_string(line)?;
-        text.push('\n');
-        self.file
-            .write_all(text.as_bytes())
-            .with_context(|| self.path.display().to_string())
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn line(step: u64) -> Line {
-        let [epoch, loss, lr, grad_norm, elapsed_s] = [0.5, 0.1 + 0.2, 1e-4, 2.0, 3.0];
-        Line {
-            step,
-            epoch,
-            loss,
-            lr,
-            grad_norm,
-            valid_relmse: None,
-            valid_ssim: None,
-            elapsed_s,
-        }
-    }
-
-    #[test]
-    fn log_is_cut_to_the_checkpoint_and_a_torn_line_goes() {
-        let dir = tempfile::tempdir().unwrap();
-        let run = RunDir {
-            path: dir.path().into(),
-        };
-        let mut metrics = run.metrics(0).unwrap();
-        for step in [10, 20, 30] {
-            metrics.append(&line(step)).unwrap();
-        }
-        let path = dir.path().join(METRICS);
-        let whole = fs::read_to_string(&path).unwrap();
-        fs::write(&path, format!("{whole}{{\"step\": 2")).unwrap();
-        run.metrics(20).unwrap();
-        let cut = fs::read_to_string(&path).unwrap();
-        assert_eq!(cut.lines().count(), 2);
-        assert!(whole.starts_with(&cut));
-    }
 
     #[test]
     fn recorded_version_of_burn_is_the_pinned_one() {
@@ -287,15 +248,5 @@ mod tests {
         let manifest: toml::Table = fs::read_to_string(manifest).unwrap().parse().unwrap();
         let burn = &manifest["workspace"]["dependencies"]["burn"]["version"];
         assert_eq!(burn.as_str(), Some(format!("={BURN}").as_str()));
-    }
-
-    #[test]
-    fn lines_without_validation_have_no_such_keys() {
-        let json = serde_json::to_string(&line(1)).unwrap();
-        assert!(
-            json.starts_with("{\"step\":1,\"epoch\":0.5,\"loss\":0.30000000000000004,"),
-            "{json}"
-        );
-        assert!(!json.contains("valid_"));
     }
 }

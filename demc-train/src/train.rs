@@ -7,15 +7,16 @@ use anyhow::{Context, ensure};
 use burn::tensor::Device;
 use demc_data::{BatchLoader, PatchSource};
 use demc_infer::bundle::locate::BEST;
-use demc_infer::bundle::{Bundle, BundleMeta, Names, Precision};
+use demc_infer::bundle::{Bundle, BundleFile, BundleMeta, Names, Precision};
 use demc_infer::evaluate::Report;
 
 use crate::checkpoint::{self, Best, Checkpoint, Means, State};
 use crate::config::Config;
 use crate::data::Data;
+use crate::metrics_log::Line;
 use crate::optimizer::Adam;
-use crate::progress::Progress;
-use crate::run_dir::{Facts, Line, RunDir};
+use crate::progress::{Progress, say};
+use crate::run_dir::{Facts, RunDir};
 use crate::trainer::{Step, Trainer, initial_model};
 use crate::validation;
 
@@ -33,7 +34,7 @@ impl Run {
     /// A new run, or the one of `checkpoint` where it stopped. `device` is plain.
     ///
     /// # Errors
-    /// Scenes smaller than a patch.
+    /// Scenes smaller than a patch; a checkpoint that is not of this run.
     pub fn new(
         config: Config,
         data: Data,
@@ -50,7 +51,24 @@ impl Run {
             config.train.seed,
         )?;
         let (model, adam, state) = match checkpoint {
-            Some(checkpoint) => (checkpoint.bundle.model, checkpoint.adam, checkpoint.state),
+            Some(Checkpoint {
+                bundle,
+                adam,
+                state,
+            }) => {
+                let (normalizer, layout) = (data.normalizer.clone(), data.layout.clone());
+                let expected = BundleMeta::new(config.model, normalizer, layout, state.step);
+                ensure!(
+                    bundle.meta == expected,
+                    "{}: the checkpoint has another network, layout or statistics than this run",
+                    dir.path().display()
+                );
+                if state.best.is_some() {
+                    // Now, not when the last step is done.
+                    BundleFile::read(&dir.path().join(BEST))?;
+                }
+                (bundle.model, adam, state)
+            }
             None => {
                 let model = initial_model(
                     &config.model,
@@ -97,7 +115,9 @@ impl Run {
             parameters: self.parameters(),
             patches: self.patches(),
         };
-        self.dir.open(&self.config, &self.data, facts)?;
+        if let Some(note) = self.dir.open(&self.config, &self.data, facts)? {
+            say(format!("note: {note}"));
+        }
         let (train, run) = (self.config.train.clone(), self.config.run.clone());
         let rate = self.config.learning_rate();
         let first_batch = self.state.step * train.grad_accumulation as u64;

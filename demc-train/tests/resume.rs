@@ -160,3 +160,51 @@ fn damaged_checkpoints_are_refused_by_name() {
             .success()
     );
 }
+
+#[test]
+fn what_a_run_lost_or_changed_is_named() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    let run = dir.path().join("run");
+    let layout = dir.path().join("mine.toml");
+    let preset = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../configs/renderers/demc-exr.toml"
+    );
+    fs::copy(preset, &layout).expect("a preset");
+    let layout_key = format!("data.layout={}", layout.display());
+    let args = ["--set", "train.steps=3", "--set", &layout_key];
+    let resume = [&args[..], &["--resume"]].concat();
+    let output = train(&config, &run, &args);
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert!(
+        run.join("layout.toml").is_file(),
+        "the run holds its own layout"
+    );
+
+    let text = fs::read_to_string(&layout).expect("a layout");
+    let swapped = text.replace(r#"["R", "G", "B"]"#, r#"["B", "G", "R"]"#);
+    assert_ne!(swapped, text);
+    fs::write(&layout, swapped).expect("a layout");
+    let error = error_line(&train(&config, &run, &resume), 1);
+    assert!(
+        error.contains("another network, layout or statistics"),
+        "{error}"
+    );
+    fs::write(&layout, text).expect("a layout");
+
+    fs::rename(run.join("latest"), dir.path().join("latest")).expect("a rename");
+    let error = error_line(&train(&config, &run, &resume), 1);
+    assert!(error.contains("latest: missing"), "{error}");
+    fs::rename(dir.path().join("latest"), run.join("latest")).expect("a rename");
+
+    let lock = fs::File::create(run.join("lock")).expect("a lock");
+    lock.try_lock().expect("nobody trains");
+    let error = error_line(&train(&config, &run, &resume), 1);
+    assert!(error.contains("another process"), "{error}");
+    drop(lock);
+
+    fs::remove_file(run.join("config.toml")).expect("a file");
+    let error = error_line(&train(&config, &run, &args), 1);
+    assert!(error.contains("no config.toml"), "{error}");
+}

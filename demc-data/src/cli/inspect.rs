@@ -2,6 +2,7 @@
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 
 use anyhow::Result;
 use demc_data::channel::{Channel, Kind};
@@ -36,14 +37,21 @@ struct Report<'a> {
     channels: Vec<Row>,
 }
 
-/// Prints a table for each file, or one JSON array of all.
-pub fn run(files: &[PathBuf], json: bool) -> Result<()> {
+/// Prints a table for each file, or one JSON array of all. A file that cannot be used is an error line on
+/// standard error and a failure at the end: the others are inspected all the same.
+pub fn run(files: &[PathBuf], json: bool) -> Result<ExitCode> {
     let mut reports = Vec::new();
+    let mut status = ExitCode::SUCCESS;
     for file in files {
-        let report = Report {
-            file,
-            channels: rows(file)?,
+        let channels = match rows(file) {
+            Ok(channels) => channels,
+            Err(error) => {
+                super::report(&error);
+                status = ExitCode::FAILURE;
+                continue;
+            }
         };
+        let report = Report { file, channels };
         if json {
             reports.push(report);
         } else {
@@ -53,7 +61,7 @@ pub fn run(files: &[PathBuf], json: bool) -> Result<()> {
     if json {
         super::print(&(serde_json::to_string_pretty(&reports)? + "\n"))?;
     }
-    Ok(())
+    Ok(status)
 }
 
 fn rows(path: &Path) -> Result<Vec<Row>> {

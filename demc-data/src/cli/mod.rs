@@ -5,6 +5,7 @@ mod stats;
 
 use std::io::{ErrorKind, Write};
 use std::path::PathBuf;
+use std::process::ExitCode;
 
 use anyhow::{Context, Result};
 use clap::{Args, Parser, Subcommand};
@@ -26,7 +27,8 @@ enum Command {
     ///
     /// Channel names are printed as a channel layout has to spell them: `Layer.channel` in a file of
     /// several parts. Minimum, maximum and mean leave out NaN and infinite samples, which the last column
-    /// counts: training and denoising refuse a file that has any.
+    /// counts: training and denoising refuse a file that has any. A file that cannot be read is reported, the
+    /// others are shown, and the exit status is 1.
     Inspect(Inspect),
     /// Measure a data set: scenes, sizes, patches, and each feature's mean and standard deviation.
     ///
@@ -69,16 +71,22 @@ struct Stats {
 }
 
 impl Cli {
-    /// Does what was asked for.
+    /// Does what was asked for and says how it ended; `inspect` has then reported the files that it cannot use.
     ///
     /// # Errors
-    /// The first file or data set that cannot be used; what came before it was printed.
-    pub fn run(self) -> Result<()> {
+    /// What ended the command, not yet reported.
+    pub fn run(self) -> Result<ExitCode> {
         match self.command {
             Command::Inspect(args) => inspect::run(&args.files, args.json),
-            Command::Stats(args) => stats::run(&args.root, &args.layout, args.split, args.json),
+            Command::Stats(args) => stats::run(&args.root, &args.layout, args.split, args.json)
+                .map(|()| ExitCode::SUCCESS),
         }
     }
+}
+
+/// Prints an error as one line on standard error.
+pub fn report(error: &anyhow::Error) {
+    eprintln!("error: {error:#}");
 }
 
 fn parse_split(text: &str) -> Result<Split, String> {

@@ -26,7 +26,7 @@ struct Report<'a> {
     negative: u64,
     /// Mean and standard deviation of each feature.
     features: Vec<Feature>,
-    /// Mean reference colour in gamma space.
+    /// The constant reference colour with the least RelMSE, in gamma space.
     flat_color: [f32; 3],
 }
 

@@ -32,6 +32,11 @@ const CHECKPOINT_EVERY: u64 = 1000;
 /// Ours: the last one may be the one that was being written.
 const KEEP: usize = 2;
 
+/// More steps than this are a slip of the keyboard: the paper's run is 250,000.
+const MOST_STEPS: u64 = 1_000_000_000;
+/// More batches in a step are one too.
+const MOST_BATCHES: u64 = 65_536;
+
 /// Everything that decides a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -119,7 +124,7 @@ impl Default for RunConfig {
 #[derive(Debug, Error)]
 pub enum ConfigError {
     /// The file cannot be read.
-    #[error("{}: {source}", path.display())]
+    #[error("{}", path.display())]
     Read {
         /// The file.
         path: PathBuf,
@@ -182,49 +187,53 @@ impl Config {
     /// Every value out of range, one line each.
     pub fn validate(&self) -> Vec<String> {
         let (train, run) = (&self.train, &self.run);
-        let positive = |value: f64| value.is_finite() && value > 0.0;
-        let checks = [
-            (train.steps > 0, "train.steps: at least 1"),
+        let mut problems = self.model.validate();
+        problems.extend(self.data.validate());
+        let mut require = |holds: bool, key: &str, value: &dyn std::fmt::Debug, allowed: &str| {
+            if !holds {
+                problems.push(format!("{key} = {value:?}: must be {allowed}"));
+            }
+        };
+        for (key, value) in [
+            ("train.lr_start", train.lr_start),
+            ("train.lr_end", train.lr_end),
+            ("train.adam_epsilon", train.adam_epsilon.into()),
+            ("train.loss_epsilon", train.loss_epsilon.into()),
+        ] {
+            let positive = value.is_finite() && value > 0.0;
+            require(positive, key, &value, "a positive number");
+        }
+        let clip = train.grad_clip;
+        let clips = clip.is_finite() && clip >= 0.0;
+        require(
+            clips,
+            "train.grad_clip",
+            &clip,
+            "0 (off) or a positive number",
+        );
+        for (key, value, most) in [
+            ("train.steps", train.steps, MOST_STEPS),
             (
-                positive(train.lr_start),
-                "train.lr_start: a positive number",
+                "train.grad_accumulation",
+                train.grad_accumulation as u64,
+                MOST_BATCHES,
             ),
-            (positive(train.lr_end), "train.lr_end: a positive number"),
-            (
-                positive(train.adam_epsilon.into()),
-                "train.adam_epsilon: a positive number",
-            ),
-            (
-                positive(train.loss_epsilon.into()),
-                "train.loss_epsilon: a positive number",
-            ),
-            (
-                train.grad_accumulation > 0,
-                "train.grad_accumulation: at least 1",
-            ),
-            (
-                train.grad_clip.is_finite() && train.grad_clip >= 0.0,
-                "train.grad_clip: 0 (off) or a positive number",
-            ),
-            (
-                train.seed <= i64::MAX as u64,
-                "train.seed: at most 9223372036854775807, TOML's largest integer",
-            ),
-            (run.log_every > 0, "run.log_every: at least 1"),
-            (run.validate_every > 0, "run.validate_every: at least 1"),
-            (run.checkpoint_every > 0, "run.checkpoint_every: at least 1"),
-            (run.keep > 0, "run.keep: at least 1"),
-        ];
-        let ours = checks
-            .into_iter()
-            .filter(|(holds, _)| !holds)
-            .map(|(_, problem)| problem.to_string());
-        self.model
-            .validate()
-            .into_iter()
-            .chain(self.data.validate())
-            .chain(ours)
-            .collect()
+            ("run.log_every", run.log_every, MOST_STEPS),
+            ("run.validate_every", run.validate_every, MOST_STEPS),
+            ("run.checkpoint_every", run.checkpoint_every, MOST_STEPS),
+            ("run.keep", run.keep as u64, MOST_STEPS),
+        ] {
+            let allowed = format!("from 1 to {most}");
+            require((1..=most).contains(&value), key, &value, &allowed);
+        }
+        let seed = train.seed <= i64::MAX as u64;
+        require(
+            seed,
+            "train.seed",
+            &train.seed,
+            "at most 9223372036854775807, TOML's largest integer",
+        );
+        problems
     }
 
     /// The configuration as TOML.
@@ -256,12 +265,15 @@ impl Config {
 
     /// The keys by which a run of `self` would differ from one of `other`; empty if one may continue the other.
     ///
-    /// Where the run is kept, how many checkpoints stay, and threads and memory of the loader change no number.
+    /// Where the run and its data are kept (scenes, statistics and layout are compared on their own), how many checkpoints
+    /// stay, and threads and memory of the loader change no number.
     pub fn differences(&self, other: &Config) -> Vec<String> {
         let essence = |config: &Config| {
             let mut config = config.clone();
             config.run.dir = PathBuf::new();
             config.run.keep = KEEP;
+            config.data.root = PathBuf::new();
+            config.data.layout = String::new();
             config.data.workers = DataConfig::default().workers;
             config.data.cache_mib = DataConfig::default().cache_mib;
             source::leaves(&config)

@@ -10,7 +10,7 @@ use toml::{Table, Value};
 use super::Config;
 
 /// How alike (0 to 1, Jaro-Winkler) a known key must be to be suggested; ours.
-const ALIKE: f64 = 0.6;
+const ALIKE: f64 = 0.75;
 
 /// Parses `text`, applies `sets`, refuses what is not known.
 pub(super) fn parse(path: &Path, text: &str, sets: &[String]) -> Result<Config, String> {
@@ -24,16 +24,16 @@ pub(super) fn parse(path: &Path, text: &str, sets: &[String]) -> Result<Config, 
     };
     let tree = DeTable::parse(text).map_err(|error| located(&error))?;
     let known = leaves(&Config::default());
-    let mut unknown = Vec::new();
+    let mut unknown = BTreeMap::new();
     unknown_keys(tree.get_ref(), "", &known, &mut |key, offset| {
-        unknown.push(format!(
-            "{path}:{}: unknown key `{key}`{}",
-            at(offset),
-            suggestion(key, &known)
-        ));
+        let hint = suggestion(key, &known);
+        unknown.insert(
+            offset,
+            format!("{path}:{}: unknown key `{key}`{hint}", at(offset)),
+        );
     });
     if !unknown.is_empty() {
-        return Err(unknown.join("; "));
+        return Err(unknown.into_values().collect::<Vec<_>>().join("; "));
     }
     let config = toml::from_str::<Config>(text).map_err(|error| located(&error))?;
     if sets.is_empty() {
@@ -85,27 +85,40 @@ fn unknown_keys(
     }
 }
 
-/// `; did you mean ...?` with the nearest known key, or the keys that there are.
-fn suggestion(key: &str, known: &BTreeMap<String, Value>) -> String {
-    let name = |path: &str| {
-        path.rsplit('.')
-            .next()
-            .map(str::to_owned)
-            .unwrap_or_default()
+/// `; did you mean ...?` with the nearest table or the nearest key of the same table, or what there is.
+fn suggestion(path: &str, known: &BTreeMap<String, Value>) -> String {
+    let tables = || known.keys().filter_map(|key| key.split('.').next());
+    let keys = |table| {
+        known
+            .keys()
+            .filter_map(move |key| key.strip_prefix(table)?.strip_prefix('.'))
     };
-    let likeness = |candidate: &str| {
-        let same_table = candidate.split('.').next() == key.split('.').next();
-        let by_name = strsim::jaro_winkler(&name(key), &name(candidate));
-        if same_table { by_name } else { by_name * 0.9 }
+    let (table, key) = match path.split_once('.') {
+        Some((table, key)) if tables().any(|known| known == table) => (table, key),
+        _ => {
+            let name = path.split('.').next().unwrap_or(path);
+            // A key without its table is as likely as a misspelt table.
+            let elsewhere = known.keys().find(|key| key.ends_with(&format!(".{path}")));
+            return match nearest(name, tables()).or(elsewhere.map(String::as_str)) {
+                Some(nearest) => format!("; did you mean `{nearest}`?"),
+                None => "; the tables are [model], [data], [train] and [run]".to_string(),
+            };
+        }
     };
-    let nearest = known
-        .keys()
-        .map(|k| (likeness(k), k))
-        .max_by(|a, b| a.0.total_cmp(&b.0));
-    match nearest {
-        Some((likeness, nearest)) if likeness > ALIKE => format!("; did you mean `{nearest}`?"),
-        _ => "; the tables are [model], [data], [train] and [run]".to_string(),
+    match nearest(key, keys(table)) {
+        Some(nearest) => format!("; did you mean `{table}.{nearest}`?"),
+        None => format!(
+            "; [{table}] has {}",
+            keys(table).collect::<Vec<_>>().join(", ")
+        ),
     }
+}
+
+/// The name that is most like `name`, if any is like it at all.
+fn nearest<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+    let likeness = known.map(|known| (strsim::jaro_winkler(name, known), known));
+    let (likeness, nearest) = likeness.max_by(|a, b| a.0.total_cmp(&b.0))?;
+    (likeness > ALIKE).then_some(nearest)
 }
 
 /// Sets one key of the tree.

@@ -1,0 +1,132 @@
+//! `metrics.jsonl`: one object a line, nothing in it depends on the clock but `elapsed_s`.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use demc_data::file::write_whole;
+use serde::Serialize;
+
+/// `metrics.jsonl`, open for more.
+#[derive(Debug)]
+pub struct Metrics {
+    file: File,
+    path: PathBuf,
+}
+
+/// One line of `metrics.jsonl`. Nothing depends on the clock but `elapsed_s`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Line {
+    /// Steps taken.
+    pub step: u64,
+    /// Passes over the training patches.
+    pub epoch: f64,
+    /// Mean training loss (Eq. 5) since the line before.
+    pub loss: f64,
+    /// Learning rate of the last step.
+    pub lr: f64,
+    /// Mean norm of the gradient since the line before, before clipping.
+    pub grad_norm: f64,
+    /// Mean RelMSE of the validation scenes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub valid_relmse: Option<f64>,
+    /// Mean SSIM of the validation scenes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub valid_ssim: Option<f64>,
+    /// Seconds since the start, stops left out.
+    pub elapsed_s: f64,
+}
+
+impl Metrics {
+    /// The log at `path`, with the lines after `step` and a torn last one cut off.
+    ///
+    /// # Errors
+    /// A log that cannot be read or written.
+    pub fn open(path: &Path, step: u64) -> anyhow::Result<Self> {
+        let text = if path.exists() {
+            fs::read_to_string(&path)
+        } else {
+            Ok(String::new())
+        };
+        let text = text.with_context(|| path.display().to_string())?;
+        let kept: String = text
+            .split_inclusive('\n')
+            .take_while(|line| is_line_until(line, step))
+            .collect();
+        if kept.len() != text.len() {
+            write_whole(path, |file| file.write_all(kept.as_bytes()))?;
+        }
+        let file = OpenOptions::new().create(true).append(true).open(path);
+        Ok(Metrics {
+            file: file.with_context(|| path.display().to_string())?,
+            path: path.to_owned(),
+        })
+    }
+
+    /// Appends a line.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn append(&mut self, line: &Line) -> anyhow::Result<()> {
+        let mut text = serde_json::to_string(line)?;
+        text.push('\n');
+        self.file
+            .write_all(text.as_bytes())
+            .with_context(|| self.path.display().to_string())
+    }
+}
+
+/// Whether `text` is a whole line of a step up to `step`.
+fn is_line_until(text: &str, step: u64) -> bool {
+    let line = text
+        .strip_suffix('\n')
+        .and_then(|line| serde_json::from_str::<serde_json::Value>(line).ok());
+    line.and_then(|line| line.get("step")?.as_u64())
+        .is_some_and(|at| at <= step)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(step: u64) -> Line {
+        let [epoch, loss, lr, grad_norm, elapsed_s] = [0.5, 0.1 + 0.2, 1e-4, 2.0, 3.0];
+        Line {
+            step,
+            epoch,
+            loss,
+            lr,
+            grad_norm,
+            valid_relmse: None,
+            valid_ssim: None,
+            elapsed_s,
+        }
+    }
+
+    #[test]
+    fn log_is_cut_to_the_checkpoint_and_a_torn_line_goes() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("metrics.jsonl");
+        let mut metrics = Metrics::open(&path, 0).unwrap();
+        for step in [10, 20, 30] {
+            metrics.append(&line(step)).unwrap();
+        }
+        let whole = fs::read_to_string(&path).unwrap();
+        fs::write(&path, format!("{whole}{{\"step\": 2")).unwrap();
+        Metrics::open(&path, 20).unwrap();
+        let cut = fs::read_to_string(&path).unwrap();
+        assert_eq!(cut.lines().count(), 2);
+        assert!(whole.starts_with(&cut));
+    }
+
+    #[test]
+    fn lines_without_validation_have_no_such_keys() {
+        let json = serde_json::to_string(&line(1)).unwrap();
+        assert!(
+            json.starts_with("{\"step\":1,\"epoch\":0.5,\"loss\":0.30000000000000004,"),
+            "{json}"
+        );
+        assert!(!json.contains("valid_"));
+    }
+}
