@@ -233,6 +233,32 @@ fn a_model_that_is_none_is_one_line() {
 }
 
 #[test]
+fn an_export_never_replaces_its_model() {
+    let run = run_directory();
+    let best = run.path().join("best.safetensors");
+    let before = fs::read(&best).expect("bundle");
+    let roundabout = run.path().join(".").join("best.safetensors");
+    for (model, output) in [
+        (best.as_path(), &best),
+        (run.path(), &best),
+        (&best, &roundabout),
+    ] {
+        let list = arguments![
+            "export",
+            "--model",
+            model,
+            "--precision",
+            "f16",
+            "-o",
+            output
+        ];
+        let start = format!("output {} would replace the model", output.display());
+        demc_infer(list).failure(2, &start);
+    }
+    assert_eq!(fs::read(&best).expect("bundle"), before);
+}
+
+#[test]
 fn an_export_that_cannot_be_written_is_named() {
     let run = run_directory();
     let list = arguments![

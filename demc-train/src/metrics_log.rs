@@ -45,7 +45,7 @@ impl Metrics {
     /// A log that cannot be read or written.
     pub fn open(path: &Path, step: u64) -> anyhow::Result<Self> {
         let text = if path.exists() {
-            fs::read_to_string(&path)
+            fs::read_to_string(path)
         } else {
             Ok(String::new())
         };

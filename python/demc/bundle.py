@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -83,23 +84,29 @@ def load(path: str | os.PathLike) -> Bundle:
         raise ValueError(f"{path}: cut short, damaged or no safetensors file: {error}") from error
     if header is None:
         raise ValueError(f"{path}: no key 'demc' in the header: not a file that demc-infer exported")
-    meta = json.loads(header)
-    if meta["format"] != FORMAT:
-        raise ValueError(f"{path}: bundle format {meta['format']}: this package reads format {FORMAT}")
-    model = Denoiser(ModelConfig(**meta["model"]))
+    try:
+        meta = json.loads(header)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: header entry 'demc': no JSON: {error}") from error
+
+    def entry(*keys: str) -> Any:
+        value = meta
+        for depth, key in enumerate(keys, 1):
+            if not isinstance(value, dict) or key not in value:
+                raise ValueError(f"{path}: header entry 'demc': no key {'.'.join(keys[:depth])}")
+            value = value[key]
+        return value
+
+    if (found := entry("format")) != FORMAT:
+        raise ValueError(f"{path}: bundle format {found}: this package reads format {FORMAT}")
+    gamma, step = entry("normalizer", "gamma"), entry("step")
+    mean, std = (torch.tensor(entry("normalizer", "features", key)) for key in ("mean", "std"))
+    model = Denoiser(ModelConfig(**entry("model")))
     try:
         model.load_state_dict(weights, strict=True)
     except RuntimeError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
-    normalizer = meta["normalizer"]
-    return Bundle(
-        model=model.eval(),
-        gamma=normalizer["gamma"],
-        feature_mean=torch.tensor(normalizer["features"]["mean"]),
-        feature_std=torch.tensor(normalizer["features"]["std"]),
-        step=meta["step"],
-        meta=meta,
-    )
+    return Bundle(model=model.eval(), gamma=gamma, feature_mean=mean, feature_std=std, step=step, meta=meta)
 
 
 def torch_name_from(name: str) -> str:

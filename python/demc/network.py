@@ -227,7 +227,8 @@ class Denoiser(nn.Module):
     """The whole network. ``Denoiser(config)`` is initialised as a training run starts (Sec. 4.2), head included."""
 
     def __init__(self, config: ModelConfig = ModelConfig(), head_bias: Sequence[float] = (0.3, 0.3, 0.3)) -> None:
-        """`head_bias` is the mean gamma-space colour of the training set, which a grey head starts from."""
+        """`head_bias` is what a grey head starts from: the flat colour, in gamma space, with the least RelMSE on the
+        training set."""
         super().__init__()
         self.config = config
         self.variant = VARIANTS[config.variant]

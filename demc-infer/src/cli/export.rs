@@ -1,11 +1,13 @@
 //! `demc-infer export`: weights for other programs, in one file.
 
+use std::fs;
 use std::path::PathBuf;
 
+use burn::tensor::Device;
 use clap::{Args, ValueEnum};
-use demc_infer::{Names, Precision};
+use demc_infer::{BundleFile, Names, Precision};
 
-use super::{Model, print};
+use super::{Model, Usage, print};
 
 /// Export a model as one file: weights, configuration, statistics and channel layout.
 ///
@@ -27,7 +29,7 @@ pub struct Export {
     /// Type of the weights; batch normalisation stays f32
     #[arg(long, value_enum, default_value = "f32")]
     precision: PrecisionFlag,
-    /// The file to write
+    /// The file to write; an existing one is replaced, but never the model itself
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
 }
@@ -52,7 +54,14 @@ enum PrecisionFlag {
 impl Export {
     /// Loads, writes, reads back, reports.
     pub fn run(self) -> anyhow::Result<()> {
-        let bundle = self.model.load()?;
+        let file = BundleFile::read(&self.model.path)?;
+        // Rounding to f16 cannot be taken back: the model must outlive its export.
+        let model = fs::canonicalize(&file.path).ok();
+        if fs::canonicalize(&self.output).is_ok_and(|output| Some(output) == model) {
+            let output = self.output.display();
+            return Err(Usage(format!("output {output} would replace the model")).into());
+        }
+        let bundle = file.into_bundle(&Device::flex())?;
         let names = match self.names {
             NamesFlag::Burn => Names::Burn,
             NamesFlag::Torch => Names::Torch,

@@ -10,7 +10,6 @@ mod inspect;
 
 use std::path::{Path, PathBuf};
 
-use burn::tensor::Device;
 use clap::{Args, Parser, Subcommand};
 use demc_infer::{Bundle, device};
 
@@ -70,11 +69,6 @@ impl Model {
     fn load_onto(&self, device: &DeviceFlag) -> anyhow::Result<Bundle> {
         let device = device::parse(&device.name).map_err(|error| Usage(error.to_string()))?;
         Ok(Bundle::load(&self.path, &device)?)
-    }
-
-    /// Loads onto the CPU, for commands that only look at the weights.
-    fn load(&self) -> anyhow::Result<Bundle> {
-        Ok(Bundle::load(&self.path, &Device::flex())?)
     }
 }
 

@@ -1,0 +1,71 @@
+"""What `demc.load` says about files it cannot use: `python -m unittest discover -s tests`, in `python/`."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import unittest
+from dataclasses import asdict
+from pathlib import Path
+
+import demc
+from safetensors.torch import save_file
+
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+class Headers(unittest.TestCase):
+    def setUp(self) -> None:
+        directory = tempfile.TemporaryDirectory()
+        self.addCleanup(directory.cleanup)
+        self.path = Path(directory.name) / "x.safetensors"
+        config = demc.ModelConfig(width=2)
+        self.weights = demc.Denoiser(config).state_dict()
+        features = {"mean": [0.0] * 12, "std": [1.0] * 12}
+        self.meta = {
+            "format": 1,
+            "model": asdict(config),
+            "normalizer": {"gamma": 2.2, "features": features},
+            "step": 7,
+        }
+
+    def write(self) -> None:
+        weights = {name: weight.contiguous() for name, weight in self.weights.items()}
+        save_file(weights, self.path, {"demc": json.dumps(self.meta)})
+
+    def test_a_whole_header_loads(self) -> None:
+        self.write()
+        self.assertEqual(demc.load(self.path).step, 7)
+
+    def test_a_missing_key_is_named(self) -> None:
+        for keys in (
+            ["format"],
+            ["model"],
+            ["step"],
+            ["normalizer"],
+            ["normalizer", "gamma"],
+            ["normalizer", "features"],
+            ["normalizer", "features", "std"],
+        ):
+            parent = self.meta
+            for key in keys[:-1]:
+                parent = parent[key]
+            value = parent.pop(keys[-1])
+            self.write()
+            with self.subTest(keys), self.assertRaisesRegex(ValueError, f"no key {'.'.join(keys)}$"):
+                demc.load(self.path)
+            parent[keys[-1]] = value
+
+    def test_the_command_prints_one_line(self) -> None:
+        del self.meta["normalizer"]
+        self.write()
+        command = [sys.executable, "-m", "demc", str(self.path)]
+        environment = os.environ | {"PYTHONPATH": str(PACKAGE)}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        self.assertEqual(done.returncode, 1)
+        self.assertEqual(done.stderr, f"error: {self.path}: header entry 'demc': no key normalizer\n")
+
+
+if __name__ == "__main__":
+    unittest.main()
