@@ -38,11 +38,11 @@ impl Data {
             .filter(|scene| scene.split == Split::Test)
             .cloned()
             .collect();
-        let statistics = Statistics::measure(&train, &layout, config.gamma)
-            .context("measuring the training scenes")?;
         let all: Vec<Scene> = train.iter().chain(&validation).cloned().collect();
         // Also those that this seed happens to hold out: another may not.
         demc_data::patch::patches(&all, config.patch_size, config.stride, config.border)?;
+        let statistics = Statistics::measure(&train, &layout, config.gamma)
+            .context("measuring the training scenes")?;
         let mut clamped = statistics.clamped;
         for scene in validation.iter().chain(&test) {
             // Now, not when a run of days comes to its table.

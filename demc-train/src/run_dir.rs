@@ -165,14 +165,13 @@ impl RunDir {
         let made = fs::create_dir_all(&self.path);
         made.with_context(|| format!("cannot make {}", self.path.display()))?;
         self.lock()?;
-        let mut saved = config.clone();
-        if config.data.layout.ends_with(".toml") {
-            let layout = toml::to_string(&data.layout)?;
-            self.write(LAYOUT, layout.as_bytes())?;
-            saved.data.layout = self.path.join(LAYOUT).to_string_lossy().into_owned();
-        }
         let record = self.path.join(RUN);
         if !record.exists() {
+            let mut saved = config.clone();
+            if config.data.layout.ends_with(".toml") {
+                self.write(LAYOUT, toml::to_string(&data.layout)?.as_bytes())?;
+                saved.data.layout = self.path.join(LAYOUT).to_string_lossy().into_owned();
+            }
             self.write(CONFIG, saved.to_toml().as_bytes())?;
             let written = Record::new(data, facts);
             self.write(RUN, &serde_json::to_vec_pretty(&written)?)?;

@@ -191,6 +191,11 @@ fn what_a_run_lost_or_changed_is_named() {
         error.contains("another network, layout or statistics"),
         "{error}"
     );
+    let kept = fs::read_to_string(run.join("layout.toml")).expect("the run's layout");
+    assert!(
+        !kept.contains(r#"["B", "G", "R"]"#),
+        "a refusal overwrites nothing: {kept}"
+    );
     fs::write(&layout, text).expect("a layout");
 
     fs::rename(run.join("latest"), dir.path().join("latest")).expect("a rename");
