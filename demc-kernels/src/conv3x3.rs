@@ -1,18 +1,150 @@
-//! NAIVE stand-in.
-use crate::{Grid, Isa, reference};
-fn f64s(x: &[f32]) -> Vec<f64> { x.iter().map(|x| f64::from(*x)).collect() }
-fn put(y: &mut [f32], x: &[f64]) { assert_eq!(y.len(), x.len()); for (y, x) in y.iter_mut().zip(x) { *y = *x as f32; } }
-/// Forward.
-#[allow(clippy::too_many_arguments)]
-pub fn forward(_isa: Isa, grid: Grid, x: &[f32], weight: &[f32], bias: &[f32], relu: bool, y: &mut [f32]) {
-    put(y, &reference::conv3x3(grid, &f64s(x), &f64s(weight), &f64s(bias), relu));
+//! The 3x3 convolution with padding 1: bias and ReLU fused, and its gradients.
+//!
+//! Wide layers go through [`crate::winograd`], those with few channels on one side through [`crate::thin`].
+
+use crate::winograd::{self, Finish};
+use crate::{Grid, Isa, thin};
+
+/// Channels from which on Winograd's transforms pay.
+const WINOGRAD_CHANNELS: usize = 8;
+
+/// Input side of a Winograd tile in training: F(2x2, 3x3), as exact as the plain sum.
+const TILE: usize = 4;
+
+fn is_wide(inputs: usize, outputs: usize) -> bool {
+    inputs.min(outputs) >= WINOGRAD_CHANNELS
 }
-/// Backward.
-#[allow(clippy::too_many_arguments)]
-pub fn backward(_isa: Isa, grid: Grid, x: &[f32], weight: &[f32], y: Option<&[f32]>, dy: &[f32], dx: Option<&mut [f32]>, dweight: &mut [f32], dbias: &mut [f32]) {
-    let dy = match y { Some(y) => reference::gated(&f64s(dy), &f64s(y)), None => f64s(dy) };
-    let g = reference::conv3x3_backward(grid, &f64s(x), &f64s(weight), &dy);
-    if let Some(dx) = dx { put(dx, &g.dx); }
-    put(dweight, &g.dweight);
-    put(dbias, &g.dbias);
+
+/// `y = x * weight + bias`, rectified where `relu`.
+///
+/// # Shapes
+/// `x` `[B, H, W, in]`, `weight` `[out, in, 3, 3]`, `bias` `[out]`, `y` `[B, H, W, out]`.
+///
+/// # Panics
+/// Where the lengths do not fit.
+#[allow(clippy::too_many_arguments, reason = "what a convolution is made of")]
+pub fn forward(
+    isa: Isa,
+    grid: Grid,
+    x: &[f32],
+    weight: &[f32],
+    bias: &[f32],
+    relu: bool,
+    y: &mut [f32],
+) {
+    let (inputs, outputs) = check(grid, x.len(), weight.len(), bias.len(), y.len());
+    let finish = Finish { bias: Some(bias), relu };
+    if is_wide(inputs, outputs) {
+        let weights = winograd::Weights::new::<TILE>(isa, weight, outputs, inputs, false);
+        winograd::convolve::<TILE>(grid, x, None, &weights, finish, y);
+    } else {
+        thin::convolve(isa, grid, x, None, weight, thin::Axes::new(outputs, inputs, false), finish, y);
+    }
+}
+
+/// Gradients of [`forward`] for `dy`, the gradient by `y`: `dx` where asked for, `dweight`, `dbias`, all overwritten.
+///
+/// `y` is the output where it was rectified: `dy` then counts where `y` is positive.
+///
+/// # Shapes
+/// As in [`forward`]; a gradient has the shape of its value.
+///
+/// # Panics
+/// Where the lengths do not fit.
+#[allow(clippy::too_many_arguments, reason = "what a convolution is made of")]
+pub fn backward(
+    isa: Isa,
+    grid: Grid,
+    x: &[f32],
+    weight: &[f32],
+    y: Option<&[f32]>,
+    dy: &[f32],
+    dx: Option<&mut [f32]>,
+    dweight: &mut [f32],
+    dbias: &mut [f32],
+) {
+    let (inputs, outputs) = check(grid, x.len(), weight.len(), dbias.len(), dy.len());
+    assert_eq!(dweight.len(), weight.len(), "a weight's gradient");
+    assert!(y.is_none_or(|y| y.len() == dy.len()), "an output of {} values", dy.len());
+    let nothing = Finish { bias: None, relu: false };
+    if is_wide(inputs, outputs) {
+        if let Some(dx) = dx {
+            let weights = winograd::Weights::new::<TILE>(isa, weight, outputs, inputs, true);
+            winograd::convolve::<TILE>(grid, dy, y, &weights, nothing, dx);
+        }
+        winograd::gradient::<TILE>(isa, grid, x, dy, y, dweight, dbias);
+    } else {
+        if let Some(dx) = dx {
+            let axes = thin::Axes::new(outputs, inputs, true);
+            thin::convolve(isa, grid, dy, y, weight, axes, nothing, dx);
+        }
+        thin::gradient(isa, grid, x, dy, y, dweight, dbias);
+    }
+}
+
+/// Input and output channels.
+fn check(grid: Grid, x: usize, weight: usize, outputs: usize, y: usize) -> (usize, usize) {
+    let inputs = grid.channels(x);
+    assert_eq!(y, grid.pixels() * outputs, "an output of {outputs} channels on {grid:?}");
+    assert_eq!(weight, outputs * inputs * 9, "a weight of {inputs} to {outputs} channels");
+    (inputs, outputs)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{assert_close, f64s, grids, pattern};
+    use crate::reference;
+
+    #[test]
+    fn equals_the_reference_on_every_path_at_odd_sizes() {
+        for isa in Isa::available() {
+            for (case, grid) in grids().into_iter().enumerate() {
+                for (inputs, outputs) in [(3, 8), (12, 5), (1, 1), (9, 3), (8, 8), (17, 33), (20, 8), (66, 16)] {
+                    let x = pattern(grid.pixels() * inputs, 1 + case as u32);
+                    let weight = pattern(outputs * inputs * 9, 2);
+                    let bias = pattern(outputs, 3);
+                    let dy = pattern(grid.pixels() * outputs, 4);
+                    for relu in [false, true] {
+                        let name = format!("{isa} {grid:?} {inputs} to {outputs}");
+                        let mut y = vec![f32::NAN; dy.len()];
+                        forward(isa, grid, &x, &weight, &bias, relu, &mut y);
+                        let expected = reference::conv3x3(grid, &f64s(&x), &f64s(&weight), &f64s(&bias), relu);
+                        assert_close(&format!("{name} y"), &y, &expected);
+
+                        let gate = relu.then_some(&y[..]);
+                        let gated = match gate {
+                            Some(y) => reference::gated(&f64s(&dy), &f64s(y)),
+                            None => f64s(&dy),
+                        };
+                        let expected = reference::conv3x3_backward(grid, &f64s(&x), &f64s(&weight), &gated);
+                        let mut dx = vec![f32::NAN; x.len()];
+                        let mut dweight = vec![f32::NAN; weight.len()];
+                        let mut dbias = vec![f32::NAN; outputs];
+                        backward(isa, grid, &x, &weight, gate, &dy, Some(&mut dx), &mut dweight, &mut dbias);
+                        assert_close(&format!("{name} dx"), &dx, &expected.dx);
+                        assert_close(&format!("{name} dweight"), &dweight, &expected.dweight);
+                        assert_close(&format!("{name} dbias"), &dbias, &expected.dbias);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn larger_tiles_keep_1e_4() {
+        for isa in Isa::available() {
+            for grid in grids() {
+                let (inputs, outputs) = (64, 17);
+                let x = pattern(grid.pixels() * inputs, 1);
+                let weight = pattern(outputs * inputs * 9, 2);
+                let bias = pattern(outputs, 3);
+                let weights = winograd::Weights::new::<6>(isa, &weight, outputs, inputs, false);
+                let mut y = vec![f32::NAN; grid.pixels() * outputs];
+                winograd::convolve::<6>(grid, &x, None, &weights, Finish { bias: Some(&bias), relu: true }, &mut y);
+                let expected = reference::conv3x3(grid, &f64s(&x), &f64s(&weight), &f64s(&bias), true);
+                crate::testing::assert_within(&format!("{isa} {grid:?}"), &y, &expected, 2e-5);
+            }
+        }
+    }
 }

@@ -17,8 +17,17 @@ pub mod deconv4x4;
 pub mod grid;
 pub mod isa;
 pub mod pool;
+mod product;
+pub mod reduce;
 pub mod reference;
 pub mod rel_mse;
+mod scratch;
+mod simd;
+#[cfg(test)]
+mod testing;
+mod thin;
+mod winograd;
+mod tasks;
 
 pub use grid::Grid;
 pub use isa::Isa;

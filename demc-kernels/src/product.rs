@@ -1,0 +1,168 @@
+//! The one product of matrices that all convolutions come down to: `C = A B`, A by its values, B and C by vectors.
+//!
+//! With channels last, a row of A is a pixel and a row of B what an input channel gives to all output channels. The
+//! inner loop multiplies one value of A with a vector of B into an accumulator; a block of rows times columns of
+//! accumulators stays in registers over the whole reduction (Goto and van de Geijn 2008, its innermost two loops; the
+//! outer ones are the callers': their blocks fit a cache as they come).
+
+use crate::simd::Simd;
+
+/// Rows that A must have readable and C writable beyond the asked ones: blocks are computed whole.
+pub(crate) const ROW_BLOCK: usize = 24;
+
+/// `rows` and what a product may touch beyond them.
+pub(crate) fn padded_rows(rows: usize) -> usize {
+    rows.next_multiple_of(ROW_BLOCK)
+}
+
+/// A left operand: `A(row, k) = *(start + row * row_step + k * k_step)`.
+#[derive(Clone, Copy)]
+pub(crate) struct Left {
+    pub(crate) start: *const f32,
+    pub(crate) row_step: usize,
+    pub(crate) k_step: usize,
+}
+
+/// A right operand, in panels of [`Simd::COLUMNS`] vectors of columns, the last one narrower.
+#[derive(Clone, Copy)]
+pub(crate) enum Right {
+    /// Panel after panel, each `[k][its columns]`: see [`Panels`].
+    Packed(*const f32),
+    /// Rows as they lie, `step` values apart, readable up to whole vectors.
+    Rows { start: *const f32, step: usize },
+}
+
+/// The columns of a packed right operand: how `columns` are cut into panels.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Panels {
+    /// Columns, rounded up to whole vectors.
+    pub(crate) padded: usize,
+    /// Columns of a full panel.
+    pub(crate) full: usize,
+}
+
+impl Panels {
+    pub(crate) fn new<S: Simd>(columns: usize) -> Self {
+        Panels {
+            padded: columns.next_multiple_of(S::LANES),
+            full: S::COLUMNS * S::LANES,
+        }
+    }
+
+    /// Where the vector of column `column` of row `k` lies, of `depth` rows.
+    pub(crate) fn place(self, depth: usize, k: usize, column: usize) -> usize {
+        let first = column / self.full * self.full;
+        let width = self.full.min(self.padded - first);
+        first * depth + k * width + (column - first)
+    }
+}
+
+/// `C = A B`, or `C += A B`: `rows` x `columns`, `depth` products each; C's rows are `c_step` values apart.
+///
+/// # Safety
+/// The machine has the path of `S`. A is readable and C writable for [`padded_rows`]; B and C have whole vectors of columns.
+#[inline(always)]
+#[allow(clippy::too_many_arguments, reason = "a product has this many")]
+pub(crate) unsafe fn product<S: Simd>(
+    rows: usize,
+    depth: usize,
+    columns: usize,
+    a: Left,
+    b: Right,
+    c: *mut f32,
+    c_step: usize,
+    accumulate: bool,
+) {
+    let panels = Panels::new::<S>(columns);
+    let mut first = 0;
+    while first < panels.padded {
+        let width = panels.full.min(panels.padded - first);
+        let (b, b_step) = match b {
+            // SAFETY: the panel lies within the operand.
+            Right::Packed(start) => (unsafe { start.add(first * depth) }, width),
+            // SAFETY: as above.
+            Right::Rows { start, step } => (unsafe { start.add(first) }, step),
+        };
+        // SAFETY: the columns from `first` are C's; the rest is the caller's.
+        unsafe {
+            let c = c.add(first);
+            match (width / S::LANES, S::ACCUMULATORS) {
+                (4, _) => strip::<S, 6, 4>(rows, depth, a, b, b_step, c, c_step, accumulate),
+                (3, _) => strip::<S, 8, 3>(rows, depth, a, b, b_step, c, c_step, accumulate),
+                (2, 24..) => strip::<S, 12, 2>(rows, depth, a, b, b_step, c, c_step, accumulate),
+                (2, 12..) => strip::<S, 6, 2>(rows, depth, a, b, b_step, c, c_step, accumulate),
+                (2, _) => strip::<S, 4, 2>(rows, depth, a, b, b_step, c, c_step, accumulate),
+                (_, 12..) => strip::<S, 12, 1>(rows, depth, a, b, b_step, c, c_step, accumulate),
+                _ => strip::<S, 8, 1>(rows, depth, a, b, b_step, c, c_step, accumulate),
+            }
+        }
+        first += width;
+    }
+}
+
+/// One panel of columns: block after block of `R` rows.
+#[inline(always)]
+#[allow(clippy::too_many_arguments, reason = "as `product`")]
+unsafe fn strip<S: Simd, const R: usize, const V: usize>(
+    rows: usize,
+    depth: usize,
+    a: Left,
+    b: *const f32,
+    b_step: usize,
+    c: *mut f32,
+    c_step: usize,
+    accumulate: bool,
+) {
+    let mut row = 0;
+    while row < rows {
+        // SAFETY: rows up to `padded_rows` are there.
+        unsafe {
+            let start = a.start.add(row * a.row_step);
+            let c = c.add(row * c_step);
+            block::<S, R, V>(depth, Left { start, ..a }, b, b_step, c, c_step, accumulate);
+        }
+        row += R;
+    }
+}
+
+/// `R` rows of `V` vectors, in registers.
+#[inline(always)]
+unsafe fn block<S: Simd, const R: usize, const V: usize>(
+    depth: usize,
+    a: Left,
+    b: *const f32,
+    b_step: usize,
+    c: *mut f32,
+    c_step: usize,
+    accumulate: bool,
+) {
+    // SAFETY: the caller's: every place is a value of A, B or C.
+    unsafe {
+        let mut sums = [[S::zero(); V]; R];
+        let (mut a_k, mut b_k) = (a.start, b);
+        for _ in 0..depth {
+            let mut columns = [S::zero(); V];
+            for v in 0..V {
+                columns[v] = S::load(b_k.add(v * S::LANES));
+            }
+            for r in 0..R {
+                let value = S::splat(*a_k.add(r * a.row_step));
+                for v in 0..V {
+                    sums[r][v] = S::fma(value, columns[v], sums[r][v]);
+                }
+            }
+            a_k = a_k.wrapping_add(a.k_step);
+            b_k = b_k.wrapping_add(b_step);
+        }
+        for r in 0..R {
+            for v in 0..V {
+                let place = c.add(r * c_step + v * S::LANES);
+                let sum = match accumulate {
+                    true => S::add(S::load(place), sums[r][v]),
+                    false => sums[r][v],
+                };
+                S::store(place, sum);
+            }
+        }
+    }
+}

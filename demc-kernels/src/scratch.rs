@@ -1,0 +1,112 @@
+//! Buffers that are used again: a training step asks for the same sizes every time, and fresh memory costs a page
+//! fault every 4 KiB.
+
+use std::ops::{Deref, DerefMut};
+use std::sync::Mutex;
+
+/// A cache line: what buffers are aligned to.
+#[derive(Clone, Copy)]
+#[repr(align(64))]
+struct Line([f32; LINE]);
+
+/// Values in a cache line.
+const LINE: usize = 16;
+
+static POOL: Mutex<Vec<Vec<Line>>> = Mutex::new(Vec::new());
+
+/// A buffer of float32 on a cache line's boundary, with whatever values its last user left there.
+pub(crate) struct Scratch {
+    lines: Vec<Line>,
+    len: usize,
+}
+
+impl Scratch {
+    /// A buffer of `len` values: the smallest returned one that is large enough, else the largest, grown.
+    pub(crate) fn take(len: usize) -> Self {
+        let count = len.div_ceil(LINE);
+        let mut lines = {
+            let mut pool = POOL.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+            let fitting = pool.iter().enumerate().filter(|(_, b)| b.len() >= count);
+            let best = fitting.min_by_key(|(_, b)| b.len()).map(|(i, _)| i);
+            let largest = || (0..pool.len()).max_by_key(|i| pool[*i].len());
+            match best.or_else(largest) {
+                Some(index) => pool.swap_remove(index),
+                None => Vec::new(),
+            }
+        };
+        if lines.len() < count {
+            lines = Vec::new();
+            lines.resize(count, Line([0.0; LINE]));
+        }
+        Scratch { lines, len }
+    }
+
+    /// A buffer of `len` zeros.
+    pub(crate) fn zeroed(len: usize) -> Self {
+        let mut scratch = Self::take(len);
+        scratch.fill(0.0);
+        scratch
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let lines = std::mem::take(&mut self.lines);
+        POOL.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).push(lines);
+    }
+}
+
+impl Deref for Scratch {
+    type Target = [f32];
+
+    fn deref(&self) -> &[f32] {
+        // SAFETY: a Line is LINE initialised values without padding, and `len` of them are there.
+        unsafe { std::slice::from_raw_parts(self.lines.as_ptr().cast(), self.len) }
+    }
+}
+
+impl DerefMut for Scratch {
+    fn deref_mut(&mut self) -> &mut [f32] {
+        // SAFETY: as for `deref`, and `self` is borrowed mutably.
+        unsafe { std::slice::from_raw_parts_mut(self.lines.as_mut_ptr().cast(), self.len) }
+    }
+}
+
+/// A pointer that threads may share; what each reads and writes through it is argued where it is used.
+#[derive(Clone, Copy)]
+pub(crate) struct Shared(*mut f32);
+
+// SAFETY: a pointer is a number; uses of it carry their own argument.
+unsafe impl Send for Shared {}
+// SAFETY: as above.
+unsafe impl Sync for Shared {}
+
+impl Shared {
+    pub(crate) fn new(slice: &mut [f32]) -> Self {
+        Shared(slice.as_mut_ptr())
+    }
+
+    /// The pointer `values` further on.
+    pub(crate) fn offset(self, values: usize) -> Self {
+        Shared(self.0.wrapping_add(values))
+    }
+
+    pub(crate) fn pointer(self) -> *mut f32 {
+        self.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn buffers_are_aligned_and_come_back() {
+        let mut first = Scratch::take(100);
+        first[99] = 7.0;
+        assert_eq!(first.as_ptr().addr() % 64, 0);
+        drop(first);
+        let zeros = Scratch::zeroed(50);
+        assert!(zeros.iter().all(|x| *x == 0.0) && zeros.len() == 50);
+    }
+}

@@ -1,0 +1,310 @@
+//! Vectors of float32: one trait, one implementation an instruction path, and the switch between them.
+//!
+//! A kernel is a [`Leaf`]: code generic over [`Simd`] that runs on one thread. [`run`] compiles it once for each path
+//! (the leaf and all it calls are `#[inline(always)]`, so that they take on the caller's target features) and picks at
+//! run time. Threads are above: target features do not cross into closures that run elsewhere.
+
+#![allow(clippy::missing_safety_doc, reason = "stated once, at the trait")]
+
+use crate::Isa;
+
+/// A vector type and its operations.
+///
+/// # Safety
+/// Every function needs the instructions of its path, which [`run`] has checked; those on pointers need the values
+/// that they name to be readable or writable. No alignment is asked for.
+pub(crate) unsafe trait Simd: Copy + Send + Sync + 'static {
+    /// A vector.
+    type V: Copy;
+    /// Values in a vector.
+    const LANES: usize;
+    /// Accumulators of a product that fit into the registers beside its operands.
+    const ACCUMULATORS: usize;
+    /// Widest block of columns in a product, in vectors.
+    const COLUMNS: usize;
+
+    unsafe fn splat(x: f32) -> Self::V;
+    unsafe fn load(p: *const f32) -> Self::V;
+    unsafe fn store(p: *mut f32, v: Self::V);
+    /// The first `n` values (1 to LANES), 0 in the other lanes.
+    unsafe fn load_part(p: *const f32, n: usize) -> Self::V;
+    /// The first `n` lanes (1 to LANES).
+    unsafe fn store_part(p: *mut f32, n: usize, v: Self::V);
+    unsafe fn add(a: Self::V, b: Self::V) -> Self::V;
+    unsafe fn sub(a: Self::V, b: Self::V) -> Self::V;
+    unsafe fn mul(a: Self::V, b: Self::V) -> Self::V;
+    unsafe fn div(a: Self::V, b: Self::V) -> Self::V;
+    /// `a * b + c` with one rounding (two on a path without fused multiply-add).
+    unsafe fn fma(a: Self::V, b: Self::V, c: Self::V) -> Self::V;
+    /// The greater; `b` where one of them is NaN.
+    unsafe fn max(a: Self::V, b: Self::V) -> Self::V;
+    unsafe fn sqrt(a: Self::V) -> Self::V;
+    /// `v` in the lanes where `gate` is positive, 0 elsewhere.
+    unsafe fn gate(v: Self::V, gate: Self::V) -> Self::V;
+    /// `yes` in the lanes where `a > b`, `no` elsewhere.
+    unsafe fn greater(a: Self::V, b: Self::V, yes: Self::V, no: Self::V) -> Self::V;
+    /// `v` where it is positive or NaN, 0 elsewhere.
+    unsafe fn relu(v: Self::V) -> Self::V;
+    /// `a` where it is NaN, `b` elsewhere.
+    unsafe fn nan_or(a: Self::V, b: Self::V) -> Self::V;
+
+    #[inline(always)]
+    unsafe fn zero() -> Self::V {
+        // SAFETY: the caller's.
+        unsafe { Self::splat(0.0) }
+    }
+}
+
+/// A piece of work for one thread.
+pub(crate) trait Leaf {
+    /// What it returns.
+    type Out;
+    /// Does it. Implementations are `#[inline(always)]`.
+    ///
+    /// # Safety
+    /// The machine has the path of `S`, and what the leaf's pointers need.
+    unsafe fn run<S: Simd>(self) -> Self::Out;
+}
+
+/// Runs `leaf` on `isa`.
+///
+/// # Safety
+/// What the leaf needs. An [`Isa`] that the machine does not have cannot be obtained but by naming it; that is checked.
+#[inline]
+pub(crate) unsafe fn run<L: Leaf>(isa: Isa, leaf: L) -> L::Out {
+    // SAFETY: `available` was checked where the Isa was made current or parsed; a bare variant is checked in debug.
+    debug_assert!(Isa::available().contains(&isa), "{isa} is not on this machine");
+    unsafe {
+        match isa {
+            #[cfg(target_arch = "x86_64")]
+            Isa::Avx512 => x86::avx512(leaf),
+            #[cfg(target_arch = "x86_64")]
+            Isa::Avx2 => x86::avx2(leaf),
+            #[cfg(target_arch = "aarch64")]
+            Isa::Neon => neon::neon(leaf),
+            _ => leaf.run::<portable::Portable>(),
+        }
+    }
+}
+
+/// Declares functions of an implementation whose bodies are single intrinsics.
+macro_rules! ops {
+    ($( fn $name:ident($($arg:ident: $ty:ty),*) $(-> $out:ty)? $body:block )*) => {
+        $(
+            #[inline(always)]
+            #[allow(unused_unsafe, reason = "some bodies of the portable path are safe")]
+            unsafe fn $name($($arg: $ty),*) $(-> $out)? {
+                // SAFETY: the trait's: the instructions are there and the values that pointers name are accessible.
+                unsafe { $body }
+            }
+        )*
+    };
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use super::{Leaf, Simd};
+    use std::arch::x86_64::*;
+
+    #[derive(Clone, Copy)]
+    pub(super) struct Avx512;
+    #[derive(Clone, Copy)]
+    pub(super) struct Avx2;
+
+    #[target_feature(enable = "avx512f,avx2,fma")]
+    pub(super) unsafe fn avx512<L: Leaf>(leaf: L) -> L::Out {
+        // SAFETY: the caller's.
+        unsafe { leaf.run::<Avx512>() }
+    }
+
+    #[target_feature(enable = "avx2,fma")]
+    pub(super) unsafe fn avx2<L: Leaf>(leaf: L) -> L::Out {
+        // SAFETY: the caller's.
+        unsafe { leaf.run::<Avx2>() }
+    }
+
+    #[inline(always)]
+    fn mask16(n: usize) -> __mmask16 {
+        ((1u32 << n) - 1) as __mmask16
+    }
+
+    // SAFETY: each function is the instruction that its name says.
+    unsafe impl Simd for Avx512 {
+        type V = __m512;
+        const LANES: usize = 16;
+        const ACCUMULATORS: usize = 24;
+        const COLUMNS: usize = 4;
+
+        ops! {
+            fn splat(x: f32) -> __m512 { _mm512_set1_ps(x) }
+            fn load(p: *const f32) -> __m512 { _mm512_loadu_ps(p) }
+            fn store(p: *mut f32, v: __m512) { _mm512_storeu_ps(p, v) }
+            fn load_part(p: *const f32, n: usize) -> __m512 { _mm512_maskz_loadu_ps(mask16(n), p) }
+            fn store_part(p: *mut f32, n: usize, v: __m512) { _mm512_mask_storeu_ps(p, mask16(n), v) }
+            fn add(a: __m512, b: __m512) -> __m512 { _mm512_add_ps(a, b) }
+            fn sub(a: __m512, b: __m512) -> __m512 { _mm512_sub_ps(a, b) }
+            fn mul(a: __m512, b: __m512) -> __m512 { _mm512_mul_ps(a, b) }
+            fn div(a: __m512, b: __m512) -> __m512 { _mm512_div_ps(a, b) }
+            fn fma(a: __m512, b: __m512, c: __m512) -> __m512 { _mm512_fmadd_ps(a, b, c) }
+            fn max(a: __m512, b: __m512) -> __m512 { _mm512_max_ps(a, b) }
+            fn sqrt(a: __m512) -> __m512 { _mm512_sqrt_ps(a) }
+            fn gate(v: __m512, gate: __m512) -> __m512 {
+                _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(gate, _mm512_setzero_ps()), v)
+            }
+            fn greater(a: __m512, b: __m512, yes: __m512, no: __m512) -> __m512 {
+                _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(a, b), no, yes)
+            }
+            // The instruction returns its second operand where one is NaN.
+            fn relu(v: __m512) -> __m512 { _mm512_max_ps(_mm512_setzero_ps(), v) }
+            fn nan_or(a: __m512, b: __m512) -> __m512 {
+                _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_UNORD_Q>(a, a), b, a)
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn mask8(n: usize) -> __m256i {
+        const ONES_THEN_ZEROS: [i32; 16] = [-1, -1, -1, -1, -1, -1, -1, -1, 0, 0, 0, 0, 0, 0, 0, 0];
+        // SAFETY: 8 values from 8 - n, n from 0 to 8, lie inside.
+        unsafe { _mm256_loadu_si256(ONES_THEN_ZEROS.as_ptr().add(8 - n).cast()) }
+    }
+
+    // SAFETY: each function is the instruction that its name says.
+    unsafe impl Simd for Avx2 {
+        type V = __m256;
+        const LANES: usize = 8;
+        const ACCUMULATORS: usize = 12;
+        const COLUMNS: usize = 2;
+
+        ops! {
+            fn splat(x: f32) -> __m256 { _mm256_set1_ps(x) }
+            fn load(p: *const f32) -> __m256 { _mm256_loadu_ps(p) }
+            fn store(p: *mut f32, v: __m256) { _mm256_storeu_ps(p, v) }
+            fn load_part(p: *const f32, n: usize) -> __m256 { _mm256_maskload_ps(p, mask8(n)) }
+            fn store_part(p: *mut f32, n: usize, v: __m256) { _mm256_maskstore_ps(p, mask8(n), v) }
+            fn add(a: __m256, b: __m256) -> __m256 { _mm256_add_ps(a, b) }
+            fn sub(a: __m256, b: __m256) -> __m256 { _mm256_sub_ps(a, b) }
+            fn mul(a: __m256, b: __m256) -> __m256 { _mm256_mul_ps(a, b) }
+            fn div(a: __m256, b: __m256) -> __m256 { _mm256_div_ps(a, b) }
+            fn fma(a: __m256, b: __m256, c: __m256) -> __m256 { _mm256_fmadd_ps(a, b, c) }
+            fn max(a: __m256, b: __m256) -> __m256 { _mm256_max_ps(a, b) }
+            fn sqrt(a: __m256) -> __m256 { _mm256_sqrt_ps(a) }
+            fn gate(v: __m256, gate: __m256) -> __m256 {
+                _mm256_and_ps(v, _mm256_cmp_ps::<_CMP_GT_OQ>(gate, _mm256_setzero_ps()))
+            }
+            fn greater(a: __m256, b: __m256, yes: __m256, no: __m256) -> __m256 {
+                _mm256_blendv_ps(no, yes, _mm256_cmp_ps::<_CMP_GT_OQ>(a, b))
+            }
+            // The instruction returns its second operand where one is NaN.
+            fn relu(v: __m256) -> __m256 { _mm256_max_ps(_mm256_setzero_ps(), v) }
+            fn nan_or(a: __m256, b: __m256) -> __m256 {
+                _mm256_blendv_ps(b, a, _mm256_cmp_ps::<_CMP_UNORD_Q>(a, a))
+            }
+        }
+    }
+}
+
+#[cfg(target_arch = "aarch64")]
+mod neon {
+    use super::{Leaf, Simd};
+    use std::arch::aarch64::*;
+
+    #[derive(Clone, Copy)]
+    pub(super) struct Neon;
+
+    #[target_feature(enable = "neon")]
+    pub(super) unsafe fn neon<L: Leaf>(leaf: L) -> L::Out {
+        // SAFETY: the caller's.
+        unsafe { leaf.run::<Neon>() }
+    }
+
+    // SAFETY: each function is the instruction that its name says.
+    unsafe impl Simd for Neon {
+        type V = float32x4_t;
+        const LANES: usize = 4;
+        const ACCUMULATORS: usize = 24;
+        const COLUMNS: usize = 4;
+
+        ops! {
+            fn splat(x: f32) -> float32x4_t { vdupq_n_f32(x) }
+            fn load(p: *const f32) -> float32x4_t { vld1q_f32(p) }
+            fn store(p: *mut f32, v: float32x4_t) { vst1q_f32(p, v) }
+            fn load_part(p: *const f32, n: usize) -> float32x4_t {
+                let mut lanes = [0.0; 4];
+                std::ptr::copy_nonoverlapping(p, lanes.as_mut_ptr(), n);
+                vld1q_f32(lanes.as_ptr())
+            }
+            fn store_part(p: *mut f32, n: usize, v: float32x4_t) {
+                let mut lanes = [0.0; 4];
+                vst1q_f32(lanes.as_mut_ptr(), v);
+                std::ptr::copy_nonoverlapping(lanes.as_ptr(), p, n);
+            }
+            fn add(a: float32x4_t, b: float32x4_t) -> float32x4_t { vaddq_f32(a, b) }
+            fn sub(a: float32x4_t, b: float32x4_t) -> float32x4_t { vsubq_f32(a, b) }
+            fn mul(a: float32x4_t, b: float32x4_t) -> float32x4_t { vmulq_f32(a, b) }
+            fn div(a: float32x4_t, b: float32x4_t) -> float32x4_t { vdivq_f32(a, b) }
+            fn fma(a: float32x4_t, b: float32x4_t, c: float32x4_t) -> float32x4_t { vfmaq_f32(c, a, b) }
+            fn max(a: float32x4_t, b: float32x4_t) -> float32x4_t { vbslq_f32(vcgtq_f32(a, b), a, b) }
+            fn sqrt(a: float32x4_t) -> float32x4_t { vsqrtq_f32(a) }
+            fn gate(v: float32x4_t, gate: float32x4_t) -> float32x4_t {
+                vbslq_f32(vcgtzq_f32(gate), v, vdupq_n_f32(0.0))
+            }
+            fn greater(a: float32x4_t, b: float32x4_t, yes: float32x4_t, no: float32x4_t) -> float32x4_t {
+                vbslq_f32(vcgtq_f32(a, b), yes, no)
+            }
+            // The instruction returns NaN where an operand is.
+            fn relu(v: float32x4_t) -> float32x4_t { vmaxq_f32(v, vdupq_n_f32(0.0)) }
+            fn nan_or(a: float32x4_t, b: float32x4_t) -> float32x4_t { vbslq_f32(vceqq_f32(a, a), b, a) }
+        }
+    }
+}
+
+mod portable {
+    use super::Simd;
+
+    /// Four lanes: what SSE2, the least that a 64-bit PC has, and most others hold in a register.
+    #[derive(Clone, Copy)]
+    pub(super) struct Portable;
+
+    #[inline(always)]
+    fn zip(a: [f32; 4], b: [f32; 4], f: impl Fn(f32, f32) -> f32) -> [f32; 4] {
+        std::array::from_fn(|i| f(a[i], b[i]))
+    }
+
+    // SAFETY: no instructions are asked for.
+    unsafe impl Simd for Portable {
+        type V = [f32; 4];
+        const LANES: usize = 4;
+        const ACCUMULATORS: usize = 8;
+        const COLUMNS: usize = 2;
+
+        ops! {
+            fn splat(x: f32) -> [f32; 4] { [x; 4] }
+            fn load(p: *const f32) -> [f32; 4] { p.cast::<[f32; 4]>().read_unaligned() }
+            fn store(p: *mut f32, v: [f32; 4]) { p.cast::<[f32; 4]>().write_unaligned(v) }
+            fn load_part(p: *const f32, n: usize) -> [f32; 4] {
+                let mut lanes = [0.0; 4];
+                std::ptr::copy_nonoverlapping(p, lanes.as_mut_ptr(), n);
+                lanes
+            }
+            fn store_part(p: *mut f32, n: usize, v: [f32; 4]) {
+                std::ptr::copy_nonoverlapping(v.as_ptr(), p, n)
+            }
+            fn add(a: [f32; 4], b: [f32; 4]) -> [f32; 4] { zip(a, b, |a, b| a + b) }
+            fn sub(a: [f32; 4], b: [f32; 4]) -> [f32; 4] { zip(a, b, |a, b| a - b) }
+            fn mul(a: [f32; 4], b: [f32; 4]) -> [f32; 4] { zip(a, b, |a, b| a * b) }
+            fn div(a: [f32; 4], b: [f32; 4]) -> [f32; 4] { zip(a, b, |a, b| a / b) }
+            fn fma(a: [f32; 4], b: [f32; 4], c: [f32; 4]) -> [f32; 4] {
+                std::array::from_fn(|i| a[i] * b[i] + c[i])
+            }
+            fn max(a: [f32; 4], b: [f32; 4]) -> [f32; 4] { zip(a, b, |a, b| if a > b { a } else { b }) }
+            fn sqrt(a: [f32; 4]) -> [f32; 4] { a.map(f32::sqrt) }
+            fn gate(v: [f32; 4], gate: [f32; 4]) -> [f32; 4] { zip(v, gate, |v, g| if g > 0.0 { v } else { 0.0 }) }
+            fn greater(a: [f32; 4], b: [f32; 4], yes: [f32; 4], no: [f32; 4]) -> [f32; 4] {
+                std::array::from_fn(|i| if a[i] > b[i] { yes[i] } else { no[i] })
+            }
+            fn relu(v: [f32; 4]) -> [f32; 4] { v.map(|v| if 0.0 > v { 0.0 } else { v }) }
+            fn nan_or(a: [f32; 4], b: [f32; 4]) -> [f32; 4] { zip(a, b, |a, b| if a.is_nan() { a } else { b }) }
+        }
+    }
+}

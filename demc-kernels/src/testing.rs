@@ -1,0 +1,42 @@
+//! What the tests of all kernels share.
+
+use crate::Grid;
+
+/// Odd sizes, a single pixel, single rows and columns, a batch.
+pub(crate) fn grids() -> Vec<Grid> {
+    let sizes = match cfg!(miri) {
+        true => vec![(1, 1, 1), (2, 3, 5)],
+        false => vec![(1, 1, 1), (1, 1, 7), (3, 5, 1), (2, 7, 9), (1, 32, 32), (3, 2, 2)],
+    };
+    let grids = sizes.into_iter().map(|(batch, height, width)| Grid { batch, height, width });
+    grids.collect()
+}
+
+/// Values from -1 to 1 that repeat late.
+pub(crate) fn pattern(len: usize, seed: u32) -> Vec<f32> {
+    let mut state = seed.wrapping_mul(2654435769);
+    let next = || {
+        state = state.wrapping_mul(1664525).wrapping_add(1013904223);
+        (state >> 8) as f32 / (1 << 23) as f32 - 1.0
+    };
+    std::iter::repeat_with(next).take(len).collect()
+}
+
+pub(crate) fn f64s(x: &[f32]) -> Vec<f64> {
+    x.iter().map(|x| f64::from(*x)).collect()
+}
+
+/// Differences of at most `bound` times the largest expected value (at least 1).
+pub(crate) fn assert_within(name: &str, found: &[f32], expected: &[f64], bound: f64) {
+    assert_eq!(found.len(), expected.len(), "{name}");
+    let scale = expected.iter().fold(1.0, |m: f64, x| m.max(x.abs()));
+    for (i, (f, e)) in found.iter().zip(expected).enumerate() {
+        let error = (f64::from(*f) - e).abs() / scale;
+        assert!(error <= bound, "{name}[{i}]: {f} instead of {e}, off by {error:e} of {scale}");
+    }
+}
+
+/// To 2e-6: some roundings of float32 (6e-8 each) of sums that are ten times their result.
+pub(crate) fn assert_close(name: &str, found: &[f32], expected: &[f64]) {
+    assert_within(name, found, expected, 2e-6);
+}
