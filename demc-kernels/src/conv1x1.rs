@@ -1,29 +1,204 @@
-//! NAIVE stand-in.
-use crate::{Grid, Isa, reference};
-fn f64s(x: &[f32]) -> Vec<f64> { x.iter().map(|x| f64::from(*x)).collect() }
-fn put(y: &mut [f32], x: &[f64]) { assert_eq!(y.len(), x.len()); for (y, x) in y.iter_mut().zip(x) { *y = *x as f32; } }
-fn cat(grid: Grid, xs: &[&[f32]]) -> Vec<f64> {
-    let mut out = Vec::new();
-    for p in 0..grid.pixels() { for x in xs { let c = grid.channels(x.len()); out.extend(x[p * c..(p + 1) * c].iter().map(|x| f64::from(*x))); } }
-    out
+//! The 1x1 convolution of one or several maps side by side: their concatenation is never made (Eq. 2).
+
+use rayon::prelude::*;
+
+use crate::rows::{self, BLOCK, Copy, Outer, Packed, Term, Window, copy, whole};
+use crate::product::padded_rows;
+use crate::scratch::Scratch;
+use crate::{Grid, Isa};
+
+/// `y = [xs] * weight + bias`, rectified where `relu`.
+///
+/// # Shapes
+/// `xs` `[B, H, W, in_i]` each, `weight` `[out, in]` with `in` the sum of all, `bias` `[out]`, `y` `[B, H, W, out]`.
+///
+/// # Panics
+/// Where the lengths do not fit.
+pub fn forward(
+    isa: Isa,
+    grid: Grid,
+    xs: &[&[f32]],
+    weight: &[f32],
+    bias: &[f32],
+    relu: bool,
+    y: &mut [f32],
+) {
+    let (inputs, outputs) = (check(grid, xs, weight.len(), bias.len(), y.len()), bias.len());
+    let total: usize = inputs.iter().map(|(_, count)| count).sum();
+    let weights: Vec<Packed> = inputs
+        .iter()
+        .map(|&(first, count)| Packed::new(isa, count, outputs, |k, o| weight[o * total + first + k]))
+        .collect();
+    let wide = whole(outputs);
+    y.par_chunks_mut(BLOCK * outputs).enumerate().for_each(|(task, y)| {
+        let (first, count) = (task * BLOCK, y.len() / outputs);
+        let windows: Vec<Window> =
+            xs.iter().zip(&inputs).map(|(x, (_, step))| Window::new(x, *step, first, count)).collect();
+        let terms: Vec<Term> = windows
+            .iter()
+            .zip(&inputs)
+            .zip(&weights)
+            .map(|((window, (_, step)), weight)| Term { rows: window.rows(), step: *step, weight })
+            .collect();
+        let mut c = Scratch::take(padded_rows(count) * wide);
+        rows::sum(isa, count, &terms, &mut c, wide);
+        copy(isa, Copy {
+            from: &c, from_step: wide, gate: None, bias: Some(bias), relu,
+            to: y, to_step: outputs, rows: count, channels: outputs,
+        });
+    });
 }
-/// Forward.
-#[allow(clippy::too_many_arguments)]
-pub fn forward(_isa: Isa, grid: Grid, xs: &[&[f32]], weight: &[f32], bias: &[f32], relu: bool, y: &mut [f32]) {
-    put(y, &reference::conv1x1(grid, &cat(grid, xs), &f64s(weight), &f64s(bias), relu));
-}
-/// Backward.
-#[allow(clippy::too_many_arguments)]
-pub fn backward(_isa: Isa, grid: Grid, xs: &[&[f32]], weight: &[f32], y: Option<&[f32]>, dy: &[f32], dxs: &mut [Option<&mut [f32]>], dweight: &mut [f32], dbias: &mut [f32]) {
-    let dy = match y { Some(y) => reference::gated(&f64s(dy), &f64s(y)), None => f64s(dy) };
-    let g = reference::conv1x1_backward(grid, &cat(grid, xs), &f64s(weight), &dy);
-    let total: usize = xs.iter().map(|x| grid.channels(x.len())).sum();
-    let mut first = 0;
-    for (x, dx) in xs.iter().zip(dxs) {
-        let c = grid.channels(x.len());
-        if let Some(dx) = dx { for p in 0..grid.pixels() { for i in 0..c { dx[p * c + i] = g.dx[p * total + first + i] as f32; } } }
-        first += c;
+
+/// Gradients of [`forward`] for `dy`, the gradient by `y`: those of `xs` where asked for, `dweight`, `dbias`, all
+/// overwritten.
+///
+/// `y` is the output where it was rectified: `dy` then counts where `y` is positive.
+///
+/// # Shapes
+/// As in [`forward`]; a gradient has the shape of its value.
+///
+/// # Panics
+/// Where the lengths do not fit.
+#[allow(clippy::too_many_arguments, reason = "what a convolution is made of")]
+pub fn backward(
+    isa: Isa,
+    grid: Grid,
+    xs: &[&[f32]],
+    weight: &[f32],
+    y: Option<&[f32]>,
+    dy: &[f32],
+    dxs: &mut [Option<&mut [f32]>],
+    dweight: &mut [f32],
+    dbias: &mut [f32],
+) {
+    let (inputs, outputs) = (check(grid, xs, weight.len(), dbias.len(), dy.len()), dbias.len());
+    assert_eq!(dweight.len(), weight.len(), "a weight's gradient");
+    assert!(y.is_none_or(|y| y.len() == dy.len()), "an output of {} values", dy.len());
+    assert_eq!(xs.len(), dxs.len(), "a gradient, or none, for each input");
+    let (total, pixels) = (inputs.iter().map(|(_, count)| count).sum::<usize>(), grid.pixels());
+    let wide = whole(outputs);
+
+    // The gated gradient with whole vectors in its rows, and its sums over blocks.
+    let mut gated = Scratch::take(pixels * wide);
+    let mut biases = vec![0.0f64; pixels.div_ceil(BLOCK) * outputs];
+    gated.par_chunks_mut(BLOCK * wide).zip(biases.par_chunks_mut(outputs)).enumerate().for_each(
+        |(task, (gated, sums))| {
+            let (first, count) = (task * BLOCK * outputs, gated.len() / wide);
+            copy(isa, Copy {
+                from: &dy[first..], from_step: outputs, gate: y.map(|y| &y[first..]), bias: None, relu: false,
+                to: gated, to_step: wide, rows: count, channels: outputs,
+            });
+            rows::column_sums(gated, wide, count, outputs, sums);
+        },
+    );
+    for (o, dbias) in dbias.iter_mut().enumerate() {
+        *dbias = biases[o..].iter().step_by(outputs).sum::<f64>() as f32;
     }
-    put(dweight, &g.dweight);
-    put(dbias, &g.dbias);
+
+    for ((dx, &(first, count)), x) in dxs.iter_mut().zip(&inputs).zip(xs) {
+        let Some(dx) = dx else { continue };
+        assert_eq!(dx.len(), x.len(), "an input's gradient");
+        let transposed = Packed::new(isa, outputs, count, |o, i| weight[o * total + first + i]);
+        dx.par_chunks_mut(BLOCK * count).enumerate().for_each(|(task, dx)| {
+            let rows = dx.len() / count;
+            let window = Window::new(&gated, wide, task * BLOCK, rows);
+            let c_step = whole(count);
+            let mut c = Scratch::take(padded_rows(rows) * c_step);
+            let term = Term { rows: window.rows(), step: wide, weight: &transposed };
+            rows::sum(isa, rows, &[term], &mut c, c_step);
+            copy(isa, Copy {
+                from: &c, from_step: c_step, gate: None, bias: None, relu: false,
+                to: dx, to_step: count, rows, channels: count,
+            });
+        });
+    }
+
+    for (x, &(first, count)) in xs.iter().zip(&inputs) {
+        // Blocks of rows read past the last pixels: those apart, from a copy.
+        let outer = |a, b, pixels| Outer { a, a_step: count, rows: count, b, b_step: wide, columns: outputs, pixels };
+        let mut products = Vec::with_capacity(2);
+        if pixels > 1 + 24_usize.div_ceil(count) {
+            let tail = 24_usize.div_ceil(count) + 1;
+            let body = pixels - tail;
+            products.push(rows::outer(isa, &[outer(x, &gated, body)], wide));
+            let end = Window::new(x, count, body, tail);
+            products.push(rows::outer(isa, &[outer(end.rows(), &gated[body * wide..], tail)], wide));
+        } else {
+            let all = Window::new(x, count, 0, pixels);
+            products.push(rows::outer(isa, &[outer(all.rows(), &gated, pixels)], wide));
+        }
+        dweight.par_chunks_mut(total).enumerate().for_each(|(o, dweight)| {
+            for (i, dweight) in dweight[first..first + count].iter_mut().enumerate() {
+                *dweight = products.iter().map(|product| product[i * wide + o]).sum();
+            }
+        });
+    }
+}
+
+/// First input channel and number of channels of each map.
+fn check(grid: Grid, xs: &[&[f32]], weight: usize, outputs: usize, y: usize) -> Vec<(usize, usize)> {
+    let mut first = 0;
+    let inputs: Vec<(usize, usize)> = xs
+        .iter()
+        .map(|x| {
+            let count = grid.channels(x.len());
+            first += count;
+            (first - count, count)
+        })
+        .collect();
+    assert_eq!(y, grid.pixels() * outputs, "an output of {outputs} channels on {grid:?}");
+    assert_eq!(weight, outputs * first, "a weight of {first} to {outputs} channels");
+    inputs
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::reference;
+    use crate::testing::{assert_close, f64s, grids, pattern};
+
+    fn concatenated(grid: Grid, xs: &[&[f32]]) -> Vec<f64> {
+        let rows = (0..grid.pixels()).flat_map(|p| {
+            xs.iter().flat_map(move |x| {
+                let channels = grid.channels(x.len());
+                x[p * channels..(p + 1) * channels].iter().map(|x| f64::from(*x))
+            })
+        });
+        rows.collect()
+    }
+
+    #[test]
+    fn equals_the_reference_of_the_concatenation_on_every_path() {
+        for isa in Isa::available() {
+            for grid in grids() {
+                for (inputs, outputs) in [(vec![6, 6, 6], 6), (vec![1], 1), (vec![33, 17], 40), (vec![64, 64, 64], 64)] {
+                    let maps: Vec<Vec<f32>> =
+                        inputs.iter().enumerate().map(|(s, c)| pattern(grid.pixels() * c, s as u32)).collect();
+                    let xs: Vec<&[f32]> = maps.iter().map(|x| &x[..]).collect();
+                    let total: usize = inputs.iter().sum();
+                    let (weight, bias) = (pattern(outputs * total, 7), pattern(outputs, 8));
+                    let dy = pattern(grid.pixels() * outputs, 9);
+                    let name = format!("{isa} {grid:?} {inputs:?} to {outputs}");
+                    let cat = concatenated(grid, &xs);
+                    let mut y = vec![f32::NAN; dy.len()];
+                    forward(isa, grid, &xs, &weight, &bias, true, &mut y);
+                    let expected = reference::conv1x1(grid, &cat, &f64s(&weight), &f64s(&bias), true);
+                    assert_close(&format!("{name} y"), &y, &expected);
+
+                    let expected = reference::conv1x1_backward(
+                        grid, &cat, &f64s(&weight), &reference::gated(&f64s(&dy), &f64s(&y)),
+                    );
+                    let mut dxs: Vec<Vec<f32>> = maps.iter().map(|x| vec![f32::NAN; x.len()]).collect();
+                    let mut slots: Vec<Option<&mut [f32]>> = dxs.iter_mut().map(|dx| Some(&mut dx[..])).collect();
+                    let (mut dweight, mut dbias) = (vec![f32::NAN; weight.len()], vec![f32::NAN; outputs]);
+                    backward(isa, grid, &xs, &weight, Some(&y), &dy, &mut slots, &mut dweight, &mut dbias);
+                    let dxs: Vec<&[f32]> = dxs.iter().map(|x| &x[..]).collect();
+                    let found: Vec<f32> = concatenated(grid, &dxs).iter().map(|x| *x as f32).collect();
+                    assert_close(&format!("{name} dx"), &found, &expected.dx);
+                    assert_close(&format!("{name} dweight"), &dweight, &expected.dweight);
+                    assert_close(&format!("{name} dbias"), &dbias, &expected.dbias);
+                }
+            }
+        }
+    }
 }

@@ -21,6 +21,7 @@ mod product;
 pub mod reduce;
 pub mod reference;
 pub mod rel_mse;
+mod rows;
 mod scratch;
 mod simd;
 #[cfg(test)]

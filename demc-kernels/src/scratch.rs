@@ -7,7 +7,7 @@ use std::sync::Mutex;
 /// A cache line: what buffers are aligned to.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
-struct Line([f32; LINE]);
+struct Line(#[allow(dead_code, reason = "read through a pointer")] [f32; LINE]);
 
 /// Values in a cache line.
 const LINE: usize = 16;

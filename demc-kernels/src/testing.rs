@@ -40,3 +40,18 @@ pub(crate) fn assert_within(name: &str, found: &[f32], expected: &[f64], bound: 
 pub(crate) fn assert_close(name: &str, found: &[f32], expected: &[f64]) {
     assert_within(name, found, expected, 2e-6);
 }
+
+/// Checks that `work` returns the same on one, two and three threads.
+pub(crate) fn same_on_any_number_of_threads<R: PartialEq + Send>(work: impl Fn() -> R + Sync) {
+    let on = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+        pool.expect("threads").install(&work)
+    };
+    let one = on(1);
+    assert!(one == on(2) && one == on(3), "results differ with the threads");
+}
+
+/// Bits of values, to compare them NaN and all.
+pub(crate) fn bits(x: &[f32]) -> Vec<u32> {
+    x.iter().map(|x| x.to_bits()).collect()
+}
