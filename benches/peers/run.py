@@ -1,0 +1,398 @@
+"""Compares this project with PyTorch, ONNX Runtime and OpenVINO: the same network, weights, input and threads.
+
+    cargo build --release -p demc-bench
+    python3 -m venv .venv
+    .venv/bin/pip install "torch>=2.9" numpy safetensors onnx onnxruntime openvino
+    .venv/bin/python benches/peers/run.py --out peers.md --out peers.json
+
+Installs nothing itself; a peer that is missing is named and left out. torch.compile needs a C++ compiler. Cases are
+training steps (forward, loss, backward, Adam) and inferences of DEMC in the paper's reading; `--list` names them.
+
+Each contender is a process of its own (`peer` of demc-bench, `contender.py`) that computes on command and is stopped
+(SIGSTOP) while it has no turn. First, what they compute must agree: outputs of inference, and of training the losses
+and norms of the gradient over 3 steps of Adam. Then each peer and this project take turns, A B A B, after a warm-up that
+no clock sees. A ratio is the peer's time over this project's in one round (above 1: this project is faster); given are
+the ratio of the medians, and the smallest and largest of the rounds. Memory is the peak of the resident set (VmHWM)
+from the start of the process to its end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import math
+import os
+import platform
+import re
+import shlex
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+from array import array
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+LEARNING_RATE = 1e-3
+QUICK_TURN_SECONDS = 0.05
+TURN_SECONDS = 1.0  # a turn takes as many steps as fit, and at least one
+# Of the largest value. Rounding takes 1e-6 to 1e-5: sums of up to 5 thousand products, in other orders, 45 layers deep.
+OUTPUT_TOLERANCE = 1e-4
+# Relative, of losses and norms. The third loss comes after two steps of Adam, whose first is as long for a gradient that
+# is all rounding as for a large one.
+TRAINING_TOLERANCE = 2e-3
+# What bf16 (8 bits) and tf32 (10 bits) leave of it; for GPUs only.
+COARSE = {"f32": 1, "tf32": 100, "bf16": 1000}
+
+
+@dataclass(frozen=True)
+class Case:
+    mode: str  # train | infer
+    width: int
+    size: tuple[int, int, int]  # batch, height, width; 1280x720 is padded to multiples of 32
+
+    @property
+    def name(self) -> str:
+        batch, height, width = self.size
+        images = f"{batch}x" if batch > 1 else ""
+        return f"{self.mode}-{images}{width}x{height}-c{self.width}"
+
+
+CASES = [Case("train", c, (4, 128, 128)) for c in (16, 32, 64)]
+CASES += [Case("infer", c, size) for size in ((1, 256, 256), (1, 736, 1280)) for c in (32, 64)]
+QUICK = [Case("train", 4, (2, 64, 64)), Case("infer", 4, (1, 64, 96))]
+
+TORCH_KINDS = ("nchw", "channels_last", "compile")
+
+
+@dataclass
+class Peer:
+    """A way to run the network."""
+
+    name: str
+    modes: tuple[str, ...]
+    arguments: list[str]
+    dtype: str = "f32"
+    onnx: bool = False  # whether it runs the exported network
+
+
+def peers_of(device: str) -> list[Peer]:
+    both = ("train", "infer")
+    if device == "cpu":
+        torch = [Peer(f"PyTorch {kind}", both, ["--kind", kind]) for kind in TORCH_KINDS]
+        return torch + [
+            Peer("ONNX Runtime", ("infer",), ["--runtime", "onnxruntime"], onnx=True),
+            Peer("OpenVINO", ("infer",), ["--runtime", "openvino"], onnx=True),
+        ]
+    return [
+        Peer(f"PyTorch {kind} {dtype}", both, ["--kind", kind, "--device", device, "--dtype", dtype], dtype)
+        for dtype in COARSE
+        for kind in ("channels_last", "compile")
+    ]
+
+
+class Failed(Exception):
+    """A contender ended or said something else than an answer."""
+
+
+class Contender:
+    """A child process that computes on command; stopped between commands."""
+
+    def __init__(self, command: list[str], environment: dict[str, str]) -> None:
+        self.errors = tempfile.TemporaryFile("w+")
+        self.process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self.errors,
+            text=True,
+            env=environment,
+            start_new_session=True,  # a group of its own, with its compiler's processes
+        )
+        try:
+            self.about = self._answer()["ready"]
+        except Failed:
+            self.close()
+            raise
+
+    def ask(self, command: str) -> dict:
+        os.killpg(self.process.pid, signal.SIGCONT)
+        try:
+            print(command, file=self.process.stdin, flush=True)
+        except BrokenPipeError:
+            pass  # the answer says why
+        return self._answer()
+
+    def _answer(self) -> dict:
+        line = self.process.stdout.readline()
+        if not line:
+            code = self.process.wait()
+            self.errors.seek(0)
+            ending = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+            raise Failed(reason(self.errors.read()) or ending)
+        os.killpg(self.process.pid, signal.SIGSTOP)
+        return json.loads(line)
+
+    def close(self) -> None:
+        for stop in (signal.SIGKILL, signal.SIGCONT):
+            try:
+                os.killpg(self.process.pid, stop)
+            except ProcessLookupError:
+                pass
+        self.process.wait()
+        for stream in (self.process.stdin, self.process.stdout, self.errors):
+            try:
+                stream.close()
+            except BrokenPipeError:
+                pass
+
+
+@dataclass
+class Result:
+    """One peer in one case."""
+
+    peer: str
+    about: str
+    ours_ms: list[float] = field(default_factory=list)
+    peer_ms: list[float] = field(default_factory=list)
+    peer_peak_mib: float | None = None
+    deviation: float = 0.0
+
+    @property
+    def ratios(self) -> list[float]:
+        return [peer / ours for peer, ours in zip(self.peer_ms, self.ours_ms)]
+
+    @property
+    def ratio(self) -> float:
+        return statistics.median(self.peer_ms) / statistics.median(self.ours_ms)
+
+
+@dataclass
+class Comparison:
+    """One case with all peers."""
+
+    case: Case
+    ours: str
+    ours_ms: list[float]
+    ours_peak_mib: float | None
+    results: list[Result]
+    notes: list[str]
+
+
+def main() -> int:
+    args = arguments()
+    if args.list:
+        print(*(case.name for case in CASES), sep="\n")
+        return 0
+    cases = QUICK if args.quick else [case for case in CASES if not args.cases or case.name in args.cases]
+    # Compiling takes a minute, the rest of a smoke run seconds.
+    peers = [peer for peer in peers_of(args.torch_device) if not args.quick or args.only or "compile" not in peer.name]
+    peers = [peer for peer in peers if not args.only or any(word.lower() in peer.name.lower() for word in args.only)]
+    print(machine(args), file=sys.stderr)
+    comparisons, page = [], ""
+    with tempfile.TemporaryDirectory() as folder:
+        for case in cases:
+            try:
+                comparisons.append(compare(case, peers, args, Path(folder)))
+            except Failed as error:
+                print(f"error: {case.name}: {args.binary}: {error}", file=sys.stderr)
+                return 1
+            # After each case: a run can take an hour.
+            page = markdown(comparisons, args)
+            for path in args.out:
+                path.write_text(as_json(comparisons, args) if path.suffix == ".json" else page)
+    print(page)
+    # In a smoke run, a peer that disagrees or fails is an error; in a long one it is a note.
+    return 1 if args.quick and any(comparison.notes for comparison in comparisons) else 0
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", nargs="+", default=[], metavar="NAME", choices=[case.name for case in CASES])
+    parser.add_argument("--list", action="store_true", help="name the cases")
+    parser.add_argument("--only", nargs="+", metavar="PEER", help="peers whose names contain one of these words")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)), help="default: all cores")
+    parser.add_argument("--quick", action="store_true", help="tiny cases, no torch.compile; fails where a peer fails")
+    parser.add_argument("--out", action="append", default=[], type=Path, metavar="FILE", help=".md or .json; repeatable")
+    parser.add_argument("--device", default="flex", help="this project's device: flex, wgpu, cuda")
+    parser.add_argument("--torch-device", default="cpu", help="PyTorch's device: cpu, cuda")
+    parser.add_argument("--binary", type=Path, default=HERE.parents[1] / "target/release/peer")
+    parser.add_argument("--arguments", default="", help="more arguments for this project's contender, in one string")
+    parser.add_argument("--python", default=sys.executable, help="the peers' interpreter; default: this one")
+    args = parser.parse_args()
+    if not args.binary.exists():
+        parser.error(f"{args.binary} is missing: cargo build --release -p demc-bench")
+    return args
+
+
+def compare(case: Case, peers: list[Peer], args: argparse.Namespace, folder: Path) -> Comparison:
+    """All peers in one case, one after the other, each in turns with this project."""
+    files = [f"--weights={folder / 'weights'}", f"--inputs={folder / 'inputs'}"]
+    size = [str(x) for x in case.size]
+    environment = os.environ | {name: str(args.threads) for name in ("RAYON_NUM_THREADS", "OMP_NUM_THREADS")}
+    make = [str(args.binary), "make", "--width", str(case.width), "--size", *size, *files]
+    subprocess.run(make, check=True, env=environment)
+    rate = [f"--lr={LEARNING_RATE}"] if case.mode == "train" else []
+    command = [str(args.binary), case.mode, *files, *rate, "--device", args.device, *shlex.split(args.arguments)]
+    ours = Contender(command, environment)
+    results, notes, own_ms = [], [], []
+    onnx = folder / f"{case.name}.onnx"
+    python = [args.python, str(HERE / "contender.py")]
+    common = [*files, f"--threads={args.threads}", f"--onnx={onnx}", *(["--quick"] if args.quick else [])]
+    try:
+        truth = check(ours, case, folder / "ours")
+        steps = turn(ours.ask("step 1")["seconds"], args)
+        for peer in peers:
+            if case.mode not in peer.modes:
+                continue
+            print(f"{case.name}: {peer.name}", file=sys.stderr)
+            contender = None
+            try:
+                if peer.onnx and not onnx.exists():
+                    subprocess.run([*python, "export", *common], check=True, capture_output=True, text=True, env=environment)
+                contender = Contender([*python, case.mode, *common, *rate, *peer.arguments], environment)
+                result = Result(peer.name, contender.about)
+                result.deviation = deviation(truth, check(contender, case, folder / "theirs"))
+                tolerance = COARSE[peer.dtype] * (OUTPUT_TOLERANCE if case.mode == "infer" else TRAINING_TOLERANCE)
+                if not result.deviation <= tolerance:
+                    raise Failed(f"computes something else: deviation {result.deviation:.1e}, allowed {tolerance:.0e}")
+                choice = contender.ask("warm")["choice"]
+                result.about += f", {choice}" if choice else ""
+                their_steps = turn(contender.ask("step 1")["seconds"], args)
+                for _ in range(args.rounds):
+                    result.ours_ms.append(1e3 * ours.ask(f"step {steps}")["seconds"])
+                    result.peer_ms.append(1e3 * contender.ask(f"step {their_steps}")["seconds"])
+                result.peer_peak_mib = contender.ask("memory")["peak_mib"]
+                results.append(result)
+                own_ms += result.ours_ms
+            except (Failed, subprocess.CalledProcessError) as error:
+                said = reason(getattr(error, "stderr", None) or str(error))
+                notes.append(f"{case.name}: {peer.name} was left out: {said}")
+            finally:
+                if contender:
+                    contender.close()
+        if not own_ms:
+            own_ms = [1e3 * ours.ask(f"step {steps}")["seconds"] for _ in range(args.rounds)]
+        peak = ours.ask("memory")["peak_mib"]
+    finally:
+        ours.close()
+    return Comparison(case, ours.about, own_ms, peak, results, notes)
+
+
+def turn(seconds: float, args: argparse.Namespace) -> int:
+    """Steps in a turn."""
+    return max(1, int((QUICK_TURN_SECONDS if args.quick else TURN_SECONDS) / seconds))
+
+
+def reason(said: str) -> str:
+    """The line of a program's last words that tells most: an exception's name and message, or the last one."""
+    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    errors = [line for line in lines if re.match(r"([\w.]*[A-Z]\w+|error): ", line)]
+    return (errors or lines or [""])[-1]
+
+
+def check(contender: Contender, case: Case, path: Path) -> list[array]:
+    """What a contender computes: an image, or losses and norms."""
+    answer = contender.ask(f"check {path}")
+    if case.mode == "train":
+        return [array("d", [value]) for value in (*answer["losses"], *answer["grad_norms"])]
+    if answer["zeros"] > 0.5:
+        raise Failed(f"{answer['zeros']:.0%} of the output is zero: equal outputs would prove nothing")
+    return [read_output(path)]
+
+
+def read_output(path: Path) -> array:
+    """The tensor `output` of a safetensors file, so that this script needs no package."""
+    data = path.read_bytes()
+    start = 8 + int.from_bytes(data[:8], "little")
+    entry = json.loads(data[8:start])["output"]
+    assert entry["dtype"] == "F32" and sys.byteorder == "little"
+    first, last = entry["data_offsets"]
+    return array("f", data[start + first : start + last])
+
+
+def deviation(ours: list[array], theirs: list[array]) -> float:
+    """The largest difference of any of the quantities, as a share of its largest value; infinite where it is no number."""
+    worst = 0.0
+    for a, b in zip(ours, theirs, strict=True):
+        if len(a) != len(b):
+            return math.inf
+        share = max(abs(x - y) for x, y in zip(a, b)) / max(abs(x) for x in a)
+        # Each sum first: NaN would get lost in `max`.
+        worst = max(worst, share) if math.isfinite(sum(a)) and math.isfinite(sum(b)) else math.inf
+    return worst
+
+
+def processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    fields = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    wide = "AVX-512" if "avx512f" in fields.get("flags", "") else "AVX2" if "avx2" in fields.get("flags", "") else ""
+    return ", ".join(filter(None, (fields.get("model name") or platform.processor() or platform.machine(), wide)))
+
+
+def machine(args: argparse.Namespace) -> str:
+    cores = len(os.sched_getaffinity(0))
+    date = datetime.date.today().isoformat()
+    return f"{processor()}, {cores} cores, {args.threads} threads, {platform.system()} {platform.machine()}, {date}"
+
+
+def mib(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}"
+
+
+def markdown(comparisons: list[Comparison], args: argparse.Namespace) -> str:
+    """A row a case against its best peer, then every peer."""
+    about = sorted({result.about.split(",")[0] for c in comparisons for result in c.results})
+    ours = sorted({comparison.ours for comparison in comparisons})
+    lines = [
+        f"{machine(args)}. {', '.join(ours)}; {', '.join(about) or 'no peer'}. Medians of {args.rounds} rounds;"
+        " ratio: the peer's time over ours, of the medians (min-max of the rounds).",
+        "",
+        "| case | ours, ms | best peer, ms | which | ratio | peak MiB, ours / peer |",
+        "|---|---:|---:|---|---:|---:|",
+    ]
+    rows = []
+    for comparison in comparisons:
+        best = min(comparison.results, key=lambda result: result.ratio, default=None)
+        for result in comparison.results or [None]:
+            row = cells(comparison, result)
+            rows.append(row)
+            if result is best:
+                lines.append(row)
+    lines += ["", "Every peer:", "", *lines[2:4], *rows]
+    if notes := [note for comparison in comparisons for note in comparison.notes]:
+        lines += ["", *(f"- {note}" for note in notes)]
+    return "\n".join(lines) + "\n"
+
+
+def cells(comparison: Comparison, result: Result | None) -> str:
+    name, ours = comparison.case.name, statistics.median(result.ours_ms if result else comparison.ours_ms)
+    if result is None:
+        return f"| {name} | {ours:.1f} | - | - | - | {mib(comparison.ours_peak_mib)} / - |"
+    which = ", ".join([result.peer, *result.about.split(", ")[1:]])
+    ratio = f"{result.ratio:.2f} ({min(result.ratios):.2f}-{max(result.ratios):.2f})"
+    memory = f"{mib(comparison.ours_peak_mib)} / {mib(result.peer_peak_mib)}"
+    return f"| {name} | {ours:.1f} | {statistics.median(result.peer_ms):.1f} | {which} | {ratio} | {memory} |"
+
+
+def as_json(comparisons: list[Comparison], args: argparse.Namespace) -> str:
+    entries = []
+    for comparison in comparisons:
+        entry = asdict(comparison) | {"name": comparison.case.name}
+        for result, fields in zip(comparison.results, entry["results"]):
+            fields |= {"ratio": result.ratio, "ratios": result.ratios}
+        entries.append(entry)
+    about = {"machine": machine(args), "threads": args.threads, "rounds": args.rounds, "device": args.device}
+    about |= {"arguments": args.arguments, "torch_device": args.torch_device}
+    return json.dumps(about | {"cases": entries}, indent=1) + "\n"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,88 @@
+//! A training step and an inference of this project, as the comparison with its peers runs them.
+//!
+//! This is the one place that says how: what a faster way to infer or to train needs is changed here.
+
+use std::convert::Infallible;
+
+use burn::tensor::{Device, Tensor, TensorData};
+use demc_infer::Bundle;
+use demc_model::Denoiser;
+use demc_train::Config;
+use demc_train::optimizer::Adam;
+use demc_train::trainer::{Step, Trainer};
+
+use crate::case::Input;
+
+/// A network that takes the same step again and again.
+pub struct Training {
+    trainer: Trainer,
+    input: Input,
+    lr: f64,
+}
+
+impl Training {
+    /// The paper's loss and optimizer (Sec. 4.2) on one batch. `device` is plain.
+    pub fn new(bundle: Bundle, input: Input, lr: f64, device: &Device) -> Self {
+        let config = Config {
+            model: bundle.meta.model,
+            ..Config::default()
+        };
+        let device = device.clone().autodiff();
+        let model = moved(&bundle.model, &device);
+        let adam = Adam::new(config.train.adam_epsilon);
+        Training {
+            trainer: Trainer::new(&config, model, adam, device),
+            input,
+            lr,
+        }
+    }
+
+    /// Batch to the device, forward, loss, backward, norm of the gradient, Adam.
+    pub fn run(&mut self) -> Step {
+        let batch = || Ok::<_, Infallible>(self.input.batch.clone());
+        let Ok(step) = self.trainer.step(self.lr, batch);
+        step
+    }
+}
+
+/// A network that denoises the same image again and again.
+pub struct Inference {
+    model: Denoiser,
+    color_gamma: Tensor<4>,
+    features_z: Tensor<4>,
+}
+
+impl Inference {
+    /// The input is put on `device` here: peers, too, start with tensors.
+    pub fn new(bundle: Bundle, input: Input, device: &Device) -> Self {
+        let tensor = |values: Vec<f32>, channels| {
+            let shape = [input.batch.size, channels, input.height, input.width];
+            Tensor::from_data(TensorData::new(values, shape), device)
+        };
+        Inference {
+            model: moved(&bundle.model, device),
+            color_gamma: tensor(input.batch.color_gamma, 3),
+            features_z: tensor(input.batch.features_z, demc_data::FEATURES),
+        }
+    }
+
+    /// The output on the host, `[B, 3, H, W]`.
+    ///
+    /// # Panics
+    /// Where the device fails.
+    pub fn run(&self) -> Vec<f32> {
+        self.model
+            .forward(self.color_gamma.clone(), self.features_z.clone())
+            .try_into_vec_as::<f32>()
+            .expect("the device computes")
+    }
+}
+
+/// The same network on `device`.
+fn moved(model: &Denoiser, device: &Device) -> Denoiser {
+    let mut weights = demc_model::Weights::new(model.weights());
+    model
+        .config()
+        .load(&mut weights, device)
+        .expect("the network's own weights")
+}

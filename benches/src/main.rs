@@ -1,0 +1,184 @@
+//! This project's contender in `benches/peers/run.py`: reads commands from stdin, answers each with a line of JSON.
+//!
+//! | command | answer |
+//! |---|---|
+//! | (start) | `{"ready": what this is}` |
+//! | `check FILE` | inference: `{"zeros": share}`, the output in FILE; training: `{"losses", "grad_norms"}` of 3 steps |
+//! | `step N` | `{"seconds": of one step, on average}` |
+//! | `memory` | `{"peak_mib": peak of the resident set; null where the system does not tell}` |
+
+use std::io::{BufRead, Write};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Context, bail};
+use clap::{Args, Parser, Subcommand};
+use demc_bench::case::{self, Input};
+use demc_bench::contender::{Inference, Training};
+use demc_infer::{Bundle, device};
+use serde_json::{Value, json};
+
+/// Steps of a check: the third loss sees what two steps made of the weights.
+const CHECK_STEPS: usize = 3;
+
+#[derive(Parser)]
+#[command(about = "This project's contender in benches/peers/run.py", version)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Write weights and inputs for all contenders
+    Make {
+        /// Base width C
+        #[arg(long)]
+        width: usize,
+        /// Images: batch, height, width
+        #[arg(long, num_args = 3, value_names = ["B", "H", "W"])]
+        size: Vec<usize>,
+        #[command(flatten)]
+        files: Files,
+    },
+    /// Take training steps on command
+    Train {
+        #[command(flatten)]
+        files: Files,
+        #[command(flatten)]
+        how: How,
+        /// Learning rate
+        #[arg(long)]
+        lr: f64,
+    },
+    /// Denoise on command
+    Infer {
+        #[command(flatten)]
+        files: Files,
+        #[command(flatten)]
+        how: How,
+    },
+}
+
+#[derive(Args)]
+struct Files {
+    /// A bundle
+    #[arg(long)]
+    weights: PathBuf,
+    /// color_gamma, features_z, reference_hdr
+    #[arg(long)]
+    inputs: PathBuf,
+}
+
+#[derive(Args)]
+struct How {
+    /// Where to compute: flex, ndarray, wgpu[:N], cuda[:N]
+    #[arg(long, default_value = "flex")]
+    device: String,
+}
+
+fn main() {
+    if let Err(error) = run(Arguments::parse().command) {
+        eprintln!("error: {error:#}");
+        std::process::exit(1);
+    }
+}
+
+fn run(command: Command) -> anyhow::Result<()> {
+    match command {
+        Command::Make { width, size, files } => {
+            let input = case::input(size[0], size[1], size[2]);
+            case::write(&case::network(width), &files.weights, &input, &files.inputs)
+        }
+        Command::Train { files, how, lr } => {
+            let device = device::parse(&how.device)?;
+            let (bundle, input) = files.read()?;
+            let mut training = Training::new(bundle, input, lr, &device);
+            serve(&how, |request| match request {
+                Request::Check(_) => {
+                    let steps: Vec<_> = (0..CHECK_STEPS).map(|_| training.run()).collect();
+                    let losses: Vec<f64> = steps.iter().map(|step| step.loss).collect();
+                    let grad_norms: Vec<f64> = steps.iter().map(|step| step.grad_norm).collect();
+                    Ok(json!({"losses": losses, "grad_norms": grad_norms}))
+                }
+                Request::Step => {
+                    training.run();
+                    Ok(Value::Null)
+                }
+            })
+        }
+        Command::Infer { files, how } => {
+            let device = device::parse(&how.device)?;
+            let (bundle, input) = files.read()?;
+            let size = [input.batch.size, input.height, input.width];
+            let inference = Inference::new(bundle, input, &device);
+            serve(&how, |request| match request {
+                Request::Check(path) => {
+                    let out = inference.run();
+                    let zeros = out.iter().filter(|x| **x == 0.0).count();
+                    case::write_tensors(path, size, &[("output", &out)])?;
+                    Ok(json!({"zeros": zeros as f64 / out.len() as f64}))
+                }
+                Request::Step => {
+                    inference.run();
+                    Ok(Value::Null)
+                }
+            })
+        }
+    }
+}
+
+impl Files {
+    fn read(&self) -> anyhow::Result<(Bundle, Input)> {
+        // On the host's backend, which every build has; the contender moves it.
+        let bundle = Bundle::load(&self.weights, &burn::tensor::Device::flex())?;
+        Ok((bundle, case::read_input(&self.inputs)?))
+    }
+}
+
+/// What the mode at hand must do.
+enum Request<'a> {
+    Check(&'a Path),
+    Step,
+}
+
+/// Answers commands until stdin ends.
+fn serve(
+    how: &How,
+    mut answer: impl FnMut(Request) -> anyhow::Result<Value>,
+) -> anyhow::Result<()> {
+    let say = |value: Value| -> anyhow::Result<()> {
+        let mut stdout = std::io::stdout().lock();
+        writeln!(stdout, "{value}")?;
+        Ok(stdout.flush()?)
+    };
+    let about = format!("demc {} ({})", env!("CARGO_PKG_VERSION"), how.device);
+    say(json!({"ready": about}))?;
+    for line in std::io::stdin().lock().lines() {
+        let line = line?;
+        match line.split_once(' ').unwrap_or((&line, "")) {
+            ("check", path) => say(answer(Request::Check(path.as_ref()))?)?,
+            ("step", count) => {
+                let count: u32 = count.parse().with_context(|| format!("`{line}`"))?;
+                let started = Instant::now();
+                for _ in 0..count {
+                    answer(Request::Step)?;
+                }
+                say(json!({"seconds": started.elapsed().as_secs_f64() / f64::from(count)}))?;
+            }
+            ("memory", _) => say(json!({"peak_mib": peak_mib()}))?,
+            _ => bail!("unknown command `{line}`"),
+        }
+    }
+    Ok(())
+}
+
+/// The largest resident set so far (Linux).
+fn peak_mib() -> Option<f64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status
+        .lines()
+        .find_map(|line| line.strip_prefix("VmHWM:"))?;
+    let kib: f64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kib / 1024.0)
+}
