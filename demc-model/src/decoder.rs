@@ -3,11 +3,11 @@
 use burn::module::Module;
 use burn::nn::BatchNorm;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
-use burn::tensor::{Tensor, activation};
 
 use crate::config::{COLOR_CHANNELS, Head, LEVELS, ModelConfig};
 use crate::init::{GREY_HEAD_SCALE, Init};
-use crate::layers::{conv3x3, deconv4x4, norm, normalised, skip_fusion};
+use crate::layers::{conv3x3, deconv4x4, norm, skip_fusion};
+use crate::ops::{Activation, Maps};
 use crate::weights::{Builder, WeightsError};
 
 /// Five levels from the deepest to the full resolution, and the output convolution.
@@ -45,17 +45,17 @@ impl Decoder {
 
     /// Decodes a latent to an image.
     ///
-    /// `skips` holds one list a level from the deepest up, with one tensor an encoder.
+    /// `skips` holds one list a level from the deepest up, with one entry an encoder.
     ///
     /// # Shapes
     /// Latent `[B, 8C, H / 32, W / 32]`, skips of level k `[B, K, H / 2^(4 - k), W / 2^(4 - k)]`, to `[B, 3, H, W]`, not negative.
-    pub fn forward(&self, latent: Tensor<4>, skips: Vec<Vec<Tensor<4>>>) -> Tensor<4> {
+    pub fn forward(&self, latent: Maps, skips: Vec<Vec<Maps>>) -> Maps {
         let image = self
             .levels
             .iter()
             .zip(skips)
             .fold(latent, |x, (level, skips)| level.forward(x, skips));
-        activation::relu(self.head.forward(image))
+        image.conv3x3(&self.head, Activation::Relu)
     }
 }
 
@@ -96,14 +96,18 @@ impl DecoderLevel {
     ///
     /// # Shapes
     /// `[B, below, H, W]` and skips `[B, K, 2H, 2W]` to `[B, K, 2H, 2W]`.
-    pub fn forward(&self, below: Tensor<4>, skips: Vec<Tensor<4>>) -> Tensor<4> {
-        let decoded = activation::relu(normalised(&self.norm, self.deconv.forward(below)));
+    pub fn forward(&self, below: Maps, skips: Vec<Maps>) -> Maps {
+        let decoded = match &self.norm {
+            Some(norm) => below
+                .deconv4x4(&self.deconv, Activation::None)
+                .batch_norm(norm, Activation::Relu),
+            None => below.deconv4x4(&self.deconv, Activation::Relu),
+        };
         let parts = std::iter::once(decoded).chain(skips).collect();
-        let fused = self.fuse.forward(Tensor::cat(parts, 1));
-        if self.activated_fusion {
-            activation::relu(fused)
-        } else {
-            fused
-        }
+        let activation = match self.activated_fusion {
+            true => Activation::Relu,
+            false => Activation::None,
+        };
+        Maps::fuse(parts, &self.fuse, activation)
     }
 }

@@ -9,6 +9,7 @@ use crate::decoder::Decoder;
 use crate::encoder::{Encoded, Encoder};
 use crate::fusion::Fusion;
 use crate::layers::ConvBlock;
+use crate::ops::{self, Maps, Ops};
 use crate::weights::{Builder, Weight, Weights, WeightsError, collect, drawn, taken};
 
 /// A denoising network of any variant and reading.
@@ -26,6 +27,8 @@ pub struct Denoiser {
     pub decoder: Decoder,
     #[module(skip)]
     config: ModelConfig,
+    #[module(skip)]
+    ops: Ops,
 }
 
 impl ModelConfig {
@@ -84,12 +87,23 @@ impl Denoiser {
             latent,
             decoder,
             config: *config,
+            ops: ops::process_default(),
         })
     }
 
     /// What this network is.
     pub fn config(&self) -> &ModelConfig {
         &self.config
+    }
+
+    /// The operations that this network asks for.
+    pub fn ops(&self) -> Ops {
+        self.ops
+    }
+
+    /// The same network on other operations; new ones ask for [`ops::process_default`].
+    pub fn with_ops(self, ops: Ops) -> Self {
+        Denoiser { ops, ..self }
     }
 
     /// Denoises gamma-compressed colour with the help of Z-scored features.
@@ -104,7 +118,10 @@ impl Denoiser {
     /// Where the shapes are others.
     pub fn forward(&self, color_gamma: Tensor<4>, features_z: Tensor<4>) -> Tensor<4> {
         assert_shapes(color_gamma.dims(), features_z.dims());
-        let detail_map = self.detail_map(features_z.clone());
+        let color_gamma = Maps::from_nchw(color_gamma, self.ops);
+        let features_z = Maps::from_nchw(features_z, self.ops);
+        let fusion = self.fusion.as_ref();
+        let detail_map = fusion.map(|fusion| fusion.forward(features_z.clone()));
         let image = |input: &Input| match input {
             Input::Color => color_gamma.clone(),
             Input::Features => features_z.clone(),
@@ -117,9 +134,7 @@ impl Denoiser {
             .encoders
             .iter()
             .zip(inputs)
-            .map(|(encoder, inputs)| {
-                encoder.forward(Tensor::cat(inputs.iter().map(image).collect(), 1))
-            })
+            .map(|(encoder, inputs)| encoder.forward(Maps::cat(inputs.iter().map(image).collect())))
             .collect();
         let bottom = encoded
             .last_mut()
@@ -127,6 +142,7 @@ impl Denoiser {
             .expect("the last encoder feeds the latent");
         self.decoder
             .forward(self.latent.forward(bottom), skips_by_level(encoded))
+            .into_nchw()
     }
 
     /// The detail map (Fig. 2 e) of Z-scored features; `None` for a variant without fusion.
@@ -134,9 +150,11 @@ impl Denoiser {
     /// # Shapes
     /// `[B, 12, H, W]` to `[B, 3, H, W]`, not negative.
     pub fn detail_map(&self, features_z: Tensor<4>) -> Option<Tensor<4>> {
-        self.fusion
-            .as_ref()
-            .map(|fusion| fusion.forward(features_z))
+        self.fusion.as_ref().map(|fusion| {
+            fusion
+                .forward(Maps::from_nchw(features_z, self.ops))
+                .into_nchw()
+        })
     }
 
     /// All weights on the host, in the order of the fields, the running statistics of batch normalisation among them.
@@ -163,8 +181,8 @@ impl Weight {
     }
 }
 
-/// The encoders' skips regrouped for the decoder: a list a level, deepest first, of one tensor an encoder.
-fn skips_by_level(encoded: Vec<Encoded>) -> Vec<Vec<Tensor<4>>> {
+/// The encoders' skips regrouped for the decoder: a list a level, deepest first, of one entry an encoder.
+fn skips_by_level(encoded: Vec<Encoded>) -> Vec<Vec<Maps>> {
     let mut encoders: Vec<_> = encoded
         .into_iter()
         .map(|e| e.skips.into_iter().rev())

@@ -2,11 +2,11 @@
 
 use burn::module::Module;
 use burn::nn::conv::Conv2d;
-use burn::tensor::{Tensor, activation, module::max_pool2d, ops::MaxPoolOptions};
 
 use crate::config::{LEVELS, ModelConfig};
 use crate::init::Init;
 use crate::layers::conv3x3;
+use crate::ops::{Activation, Maps};
 use crate::weights::{Builder, WeightsError};
 
 /// Five levels, from the full resolution down.
@@ -19,10 +19,10 @@ pub struct Encoder {
 /// What an encoder hands to the decoder.
 #[derive(Debug)]
 pub struct Encoded {
-    /// One tensor a level, `[B, K_i, H / 2^i, W / 2^i]` for i = 0..5, K_i the level's channels.
-    pub skips: Vec<Tensor<4>>,
+    /// One a level, `[B, K_i, H / 2^i, W / 2^i]` for i = 0..5, K_i the level's channels.
+    pub skips: Vec<Maps>,
     /// What lies below the last level, `[B, 8C, H / 32, W / 32]`: the latent's input, where the encoder computes it.
-    pub bottom: Option<Tensor<4>>,
+    pub bottom: Option<Maps>,
 }
 
 impl Encoder {
@@ -64,7 +64,7 @@ impl Encoder {
     ///
     /// # Shapes
     /// `[B, input, H, W]`, H and W multiples of 32, to [`Encoded`].
-    pub fn forward(&self, image: Tensor<4>) -> Encoded {
+    pub fn forward(&self, image: Maps) -> Encoded {
         let mut skips = Vec::with_capacity(LEVELS);
         let mut x = Some(image);
         for level in &self.levels {
@@ -95,19 +95,18 @@ impl EncoderLevel {
     ///
     /// # Shapes
     /// `[B, in, H, W]` to `[B, K, H, W]` and `[B, K, H / 2, W / 2]`.
-    pub fn forward(&self, x: Tensor<4>) -> (Tensor<4>, Option<Tensor<4>>) {
+    pub fn forward(&self, x: Maps) -> (Maps, Option<Maps>) {
         let (before, after) = self.convs.split_at(self.skip_after);
         let skip = convolve(before, x);
-        let below = self.pooled.then(|| {
-            let x = convolve(after, skip.clone());
-            max_pool2d(x, MaxPoolOptions::new([2, 2]))
-        });
+        let below = self
+            .pooled
+            .then(|| convolve(after, skip.clone()).max_pool());
         (skip, below)
     }
 }
 
-fn convolve(convs: &[Conv2d], x: Tensor<4>) -> Tensor<4> {
+fn convolve(convs: &[Conv2d], x: Maps) -> Maps {
     convs
         .iter()
-        .fold(x, |x, conv| activation::relu(conv.forward(x)))
+        .fold(x, |x, conv| x.conv3x3(conv, Activation::Relu))
 }

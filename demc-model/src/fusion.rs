@@ -1,10 +1,10 @@
 //! The feature fusion sub-network (Sec. 3.2): twelve feature channels to a three-channel detail map (Fig. 2 e).
 
 use burn::module::Module;
-use burn::tensor::Tensor;
 
 use crate::config::{DETAIL_CHANNELS, FEATURE_CHANNELS};
 use crate::layers::ConvBlock;
+use crate::ops::Maps;
 use crate::weights::{Builder, WeightsError};
 
 /// Four convolutional blocks; the two in the middle are batch normalised.
@@ -34,7 +34,7 @@ impl Fusion {
     ///
     /// # Shapes
     /// `[B, 12, H, W]` to `[B, 3, H, W]`.
-    pub fn forward(&self, features_z: Tensor<4>) -> Tensor<4> {
+    pub fn forward(&self, features_z: Maps) -> Maps {
         self.blocks
             .iter()
             .fold(features_z, |x, block| block.forward(x))

@@ -6,9 +6,9 @@
 use burn::module::{Module, Param};
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
 use burn::nn::{BatchNorm, PaddingConfig2d};
-use burn::tensor::{Tensor, activation};
 
 use crate::init::Init;
+use crate::ops::{Activation, Maps};
 use crate::weights::{Builder, WeightsError};
 
 /// Epsilon of every batch normalisation (the authors' TensorFlow 1.13 default; network.md).
@@ -47,16 +47,13 @@ impl ConvBlock {
     ///
     /// # Shapes
     /// `[B, in, H, W]` to `[B, out, H, W]`.
-    pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        activation::relu(normalised(&self.norm, self.conv.forward(x)))
-    }
-}
-
-/// `x` through the normalisation, if there is one.
-pub(crate) fn normalised(norm: &Option<BatchNorm>, x: Tensor<4>) -> Tensor<4> {
-    match norm {
-        Some(norm) => norm.forward(x),
-        None => x,
+    pub fn forward(&self, x: Maps) -> Maps {
+        match &self.norm {
+            Some(norm) => x
+                .conv3x3(&self.conv, Activation::None)
+                .batch_norm(norm, Activation::Relu),
+            None => x.conv3x3(&self.conv, Activation::Relu),
+        }
     }
 }
 

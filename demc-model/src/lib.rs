@@ -5,6 +5,8 @@
 //! [`fusion`] squeezes twelve feature channels into a detail map, each [`encoder`] halves its input five times, and
 //! the [`decoder`] climbs back from the latent, fusing the encoders' skips on its way.
 //!
+//! What the layers compute is one of two implementations of the same operations ([`ops`]): our CPU kernels or Burn's own.
+//!
 //! Tensors are NCHW, float32; height and width are multiples of [`DOWNSAMPLING`]. Files, statistics and patches are
 //! not known here: see `demc-data`.
 
@@ -16,8 +18,10 @@ pub mod fusion;
 pub mod init;
 pub mod layers;
 pub mod metrics;
+pub mod ops;
 pub mod weights;
 
 pub use config::{DOWNSAMPLING, Head, ModelConfig, Reading, Variant};
 pub use denoiser::Denoiser;
+pub use ops::Ops;
 pub use weights::{Weight, Weights, WeightsError};

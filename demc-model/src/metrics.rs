@@ -6,6 +6,8 @@
 
 use burn::tensor::Tensor;
 
+use crate::ops::{self, Ops};
+
 /// Epsilon of Eq. 5.
 pub const LOSS_EPSILON: f32 = 0.001;
 
@@ -35,6 +37,21 @@ pub fn rel_mse(out_hdr: Tensor<4>, ref_hdr: Tensor<4>, epsilon: f32) -> Tensor<1
     let difference = out_hdr - ref_hdr.clone();
     let relative = difference.square() / ref_hdr.square().add_scalar(epsilon);
     relative.sum().div_scalar((batch * height * width) as f32)
+}
+
+/// The training loss of a network's output: [`rel_mse`] of [`hdr_from_gamma`], in one operation with its gradient where the
+/// kernels run. The reference has no gradient there.
+///
+/// # Shapes
+/// `out_gamma` in gamma space and `ref_hdr` in linear HDR, `[B, 3, H, W]`, to `[1]`.
+pub fn loss(
+    ops: Ops,
+    out_gamma: Tensor<4>,
+    ref_hdr: Tensor<4>,
+    gamma: f32,
+    epsilon: f32,
+) -> Tensor<1> {
+    ops::rel_mse_of_gamma(ops, out_gamma, ref_hdr, gamma, epsilon)
 }
 
 /// `relmse` of an image (Eq. 5, epsilon 0.001), in float64.

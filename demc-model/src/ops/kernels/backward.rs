@@ -1,0 +1,419 @@
+//! The kernels on `flex` under autodiff: what each forward pass keeps, and the way back.
+//!
+//! A step keeps tensors, not copies: `flex` shares memory by reference count, and what one operation keeps as its output is
+//! what the next one keeps as its input. A gradient that nobody asks for (by the network's inputs) is not computed.
+
+use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
+use burn::backend::autodiff::grads::Gradients;
+use burn::backend::autodiff::ops::{Backward, NodeGuard, Ops, OpsKind};
+use burn::backend::flex::FlexTensor;
+use burn::backend::ops::FloatTensorOps;
+use burn::backend::tensor::FloatTensor;
+use burn::backend::{Autodiff, AutodiffBackend, Flex};
+use demc_kernels::{Grid, Isa, batch_norm, conv1x1, conv3x3, deconv4x4, pool};
+
+use super::KernelOps;
+use super::forward::{fuse, rel_mse_into};
+use super::slices::{buffer, contiguous, dims, grid, maps, tensor, values};
+
+/// A tensor of `flex` under autodiff.
+type Tracked = FloatTensor<Autodiff<Flex>>;
+
+impl<C: CheckpointStrategy> KernelOps for Autodiff<Flex, C> {
+    fn nhwc_from_nchw(x: Tracked) -> Tracked {
+        let (x, x_node) = x.into_parts();
+        record::<_, C, _>(Relayout::ToNhwc, [x_node], Flex::nhwc_from_nchw(x), |_| ())
+    }
+
+    fn nchw_from_nhwc(x: Tracked) -> Tracked {
+        let (x, x_node) = x.into_parts();
+        record::<_, C, _>(Relayout::ToNchw, [x_node], Flex::nchw_from_nhwc(x), |_| ())
+    }
+
+    fn conv3x3(x: Tracked, weight: Tracked, bias: Tracked, relu: bool) -> Tracked {
+        let ([x, weight, bias], nodes) = parts([x, weight, bias]);
+        let y = Flex::conv3x3(x.clone(), weight.clone(), bias, relu);
+        record::<_, C, _>(Conv3x3, nodes, y, |y| ConvState {
+            inputs: [x],
+            weight,
+            y: relu.then(|| y.clone()),
+        })
+    }
+
+    fn deconv4x4(x: Tracked, weight: Tracked, bias: Tracked, relu: bool) -> Tracked {
+        let ([x, weight, bias], nodes) = parts([x, weight, bias]);
+        let y = Flex::deconv4x4(x.clone(), weight.clone(), bias, relu);
+        record::<_, C, _>(Deconv4x4, nodes, y, |y| ConvState {
+            inputs: [x],
+            weight,
+            y: relu.then(|| y.clone()),
+        })
+    }
+
+    fn fuse_two(a: Tracked, b: Tracked, weight: Tracked, bias: Tracked, relu: bool) -> Tracked {
+        let ([a, b, weight, bias], nodes) = parts([a, b, weight, bias]);
+        fuse_recorded::<C, 2, 4>([a, b], weight, bias, nodes, relu)
+    }
+
+    fn fuse_three(
+        a: Tracked,
+        b: Tracked,
+        c: Tracked,
+        weight: Tracked,
+        bias: Tracked,
+        relu: bool,
+    ) -> Tracked {
+        let ([a, b, c, weight, bias], nodes) = parts([a, b, c, weight, bias]);
+        fuse_recorded::<C, 3, 5>([a, b, c], weight, bias, nodes, relu)
+    }
+
+    fn max_pool(x: Tracked) -> Tracked {
+        let ([x], nodes) = parts([x]);
+        record::<_, C, _>(MaxPool, nodes, Flex::max_pool(x.clone()), |_| x)
+    }
+
+    fn batch_norm(
+        _x: Tracked,
+        _gamma: Tracked,
+        _beta: Tracked,
+        _mean: Tracked,
+        _variance: Tracked,
+        _epsilon: f32,
+        _relu: bool,
+    ) -> Tracked {
+        unreachable!("maps with autodiff are normalised by batch_norm_train or by Burn")
+    }
+
+    fn batch_norm_train(
+        x: Tracked,
+        gamma: Tracked,
+        beta: Tracked,
+        epsilon: f32,
+        relu: bool,
+    ) -> (Tracked, Tracked, Tracked) {
+        let ([x, gamma, beta], nodes) = parts([x, gamma, beta]);
+        let (y, mean, variance) =
+            Flex::batch_norm_train(x.clone(), gamma.clone(), beta, epsilon, relu);
+        let statistics = [mean.clone(), variance.clone()];
+        let y = record::<_, C, _>(BatchNorm, nodes, y, |y| NormState {
+            x,
+            gamma,
+            statistics,
+            epsilon,
+            y: relu.then(|| y.clone()),
+        });
+        let untracked = <Self as AutodiffBackend>::from_inner;
+        (y, untracked(mean), untracked(variance))
+    }
+
+    fn rel_mse_of_gamma(out_gamma: Tracked, ref_hdr: Tracked, gamma: f32, epsilon: f32) -> Tracked {
+        let ([out_gamma], nodes) = parts([out_gamma]);
+        let ref_hdr = contiguous(ref_hdr.into_primitive());
+        // With the loss, its gradient: the root and the power are those of the loss.
+        let mut dout = buffer(values(&out_gamma).len());
+        let loss = rel_mse_into(&out_gamma, &ref_hdr, gamma, epsilon, Some(&mut dout));
+        let dout = tensor(dout, dims::<4>(&out_gamma));
+        record::<_, C, _>(RelMse, nodes, loss, |_| dout)
+    }
+}
+
+/// The tensors, [`contiguous`], and their nodes.
+fn parts<const N: usize>(tensors: [Tracked; N]) -> ([FlexTensor; N], [NodeGuard; N]) {
+    let mut nodes = Vec::with_capacity(N);
+    let tensors = tensors.map(|tensor| {
+        let (tensor, node) = tensor.into_parts();
+        nodes.push(node);
+        contiguous(tensor)
+    });
+    let nodes = nodes.try_into().expect("a node a tensor");
+    (tensors, nodes)
+}
+
+/// Records `step` with what it keeps, where any of its inputs has a gradient.
+fn record<S, C, const N: usize>(
+    step: S,
+    nodes: [NodeGuard; N],
+    output: FlexTensor,
+    state: impl FnOnce(&FlexTensor) -> S::State,
+) -> Tracked
+where
+    S: Backward<Flex, N>,
+    C: CheckpointStrategy,
+{
+    match step.prepare::<C>(nodes).compute_bound().stateful() {
+        OpsKind::Tracked(prep) => {
+            let state = state(&output);
+            prep.finish(state, output)
+        }
+        OpsKind::UnTracked(prep) => prep.finish(output),
+    }
+}
+
+/// What a convolution of `P` inputs keeps.
+#[derive(Clone, Debug)]
+struct ConvState<const P: usize> {
+    inputs: [FlexTensor; P],
+    weight: FlexTensor,
+    /// The output, where it was rectified.
+    y: Option<FlexTensor>,
+}
+
+/// What a convolution's kernel takes on the way back.
+struct ConvGradients<'a, const P: usize> {
+    grid: Grid,
+    inputs: [&'a [f32]; P],
+    weight: &'a [f32],
+    y: Option<&'a [f32]>,
+    dy: &'a [f32],
+    dinputs: [Option<&'a mut [f32]>; P],
+    dweight: &'a mut [f32],
+    dbias: &'a mut [f32],
+}
+
+/// The way back through a convolution: `kernel` fills buffers, which are registered where somebody asks for them.
+///
+/// The nodes are those of the inputs, the weight and the bias; the weight's axis `output_axis` is the output's channels.
+fn convolution_back<const P: usize, const N: usize>(
+    ops: Ops<ConvState<P>, N>,
+    grads: &mut Gradients,
+    output_axis: usize,
+    kernel: impl FnOnce(ConvGradients<P>),
+) {
+    let dy = contiguous(grads.consume::<Flex>(&ops.node));
+    let ConvState { inputs, weight, y } = ops.state;
+    let mut nodes = ops.parents.into_iter();
+    let input_nodes: [_; P] = std::array::from_fn(|_| nodes.next().flatten());
+    let [weight_node, bias_node] = std::array::from_fn(|_| nodes.next().flatten());
+
+    let (grid, _) = grid(&inputs[0]);
+    let shape = dims::<4>(&weight);
+    let mut dinputs: [_; P] = std::array::from_fn(|i| {
+        let asked = input_nodes[i].as_ref();
+        asked.map(|_| buffer(values(&inputs[i]).len()))
+    });
+    let mut dweight = buffer(values(&weight).len());
+    let mut dbias = buffer(shape[output_axis]);
+    kernel(ConvGradients {
+        grid,
+        inputs: inputs.each_ref().map(values),
+        weight: values(&weight),
+        y: y.as_ref().map(values),
+        dy: values(&dy),
+        dinputs: dinputs.each_mut().map(Option::as_deref_mut),
+        dweight: &mut dweight,
+        dbias: &mut dbias,
+    });
+    for (node, dinput) in input_nodes.into_iter().zip(dinputs) {
+        if let (Some(node), Some(dinput)) = (node, dinput) {
+            grads.register::<Flex>(node.id, maps(grid, dinput));
+        }
+    }
+    if let Some(node) = weight_node {
+        grads.register::<Flex>(node.id, tensor(dweight, shape));
+    }
+    if let Some(node) = bias_node {
+        grads.register::<Flex>(node.id, tensor(dbias, [shape[output_axis]]));
+    }
+}
+
+#[derive(Debug)]
+struct Conv3x3;
+
+impl Backward<Flex, 3> for Conv3x3 {
+    type State = ConvState<1>;
+
+    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
+        convolution_back(ops, grads, 0, |g| {
+            let ([x], [dx]) = (g.inputs, g.dinputs);
+            conv3x3::backward(
+                Isa::current(),
+                g.grid,
+                x,
+                g.weight,
+                g.y,
+                g.dy,
+                dx,
+                g.dweight,
+                g.dbias,
+            );
+        });
+    }
+}
+
+#[derive(Debug)]
+struct Deconv4x4;
+
+impl Backward<Flex, 3> for Deconv4x4 {
+    type State = ConvState<1>;
+
+    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
+        convolution_back(ops, grads, 1, |g| {
+            let ([x], [dx]) = (g.inputs, g.dinputs);
+            deconv4x4::backward(
+                Isa::current(),
+                g.grid,
+                x,
+                g.weight,
+                g.y,
+                g.dy,
+                dx,
+                g.dweight,
+                g.dbias,
+            );
+        });
+    }
+}
+
+/// A fusion of `P` parts, whose `N` nodes are the parts', the weight's and the bias's.
+#[derive(Debug)]
+struct Fuse<const P: usize>;
+
+impl<const P: usize, const N: usize> Backward<Flex, N> for Fuse<P> {
+    type State = ConvState<P>;
+
+    fn backward(self, ops: Ops<Self::State, N>, grads: &mut Gradients, _: &mut Checkpointer) {
+        convolution_back(ops, grads, 0, |mut g| {
+            conv1x1::backward(
+                Isa::current(),
+                g.grid,
+                &g.inputs,
+                g.weight,
+                g.y,
+                g.dy,
+                &mut g.dinputs,
+                g.dweight,
+                g.dbias,
+            );
+        });
+    }
+}
+
+fn fuse_recorded<C: CheckpointStrategy, const P: usize, const N: usize>(
+    inputs: [FlexTensor; P],
+    weight: FlexTensor,
+    bias: FlexTensor,
+    nodes: [NodeGuard; N],
+    relu: bool,
+) -> Tracked {
+    let y = fuse(inputs.clone(), weight.clone(), bias, relu);
+    record::<_, C, N>(Fuse::<P>, nodes, y, |y| ConvState {
+        inputs,
+        weight,
+        y: relu.then(|| y.clone()),
+    })
+}
+
+#[derive(Debug)]
+struct MaxPool;
+
+impl Backward<Flex, 1> for MaxPool {
+    /// The input.
+    type State = FlexTensor;
+
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = contiguous(grads.consume::<Flex>(&ops.node));
+        let ([node], x) = (ops.parents, ops.state);
+        if let Some(node) = node {
+            let (grid, _) = grid(&x);
+            let mut dx = buffer(values(&x).len());
+            pool::backward(Isa::current(), grid, values(&x), values(&dy), &mut dx);
+            grads.register::<Flex>(node.id, maps(grid, dx));
+        }
+    }
+}
+
+#[derive(Debug)]
+struct BatchNorm;
+
+/// What a batch normalisation keeps.
+#[derive(Clone, Debug)]
+struct NormState {
+    x: FlexTensor,
+    gamma: FlexTensor,
+    /// Mean and variance of the batch.
+    statistics: [FlexTensor; 2],
+    epsilon: f32,
+    /// The output, where it was rectified.
+    y: Option<FlexTensor>,
+}
+
+impl Backward<Flex, 3> for BatchNorm {
+    type State = NormState;
+
+    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = contiguous(grads.consume::<Flex>(&ops.node));
+        let NormState {
+            x,
+            gamma,
+            statistics,
+            epsilon,
+            y,
+        } = ops.state;
+        let (grid, channels) = grid(&x);
+        let mut dx = buffer(values(&x).len());
+        let [mut dgamma, mut dbeta] = [buffer(channels), buffer(channels)];
+        batch_norm::backward(
+            Isa::current(),
+            values(&x),
+            values(&gamma),
+            values(&statistics[0]),
+            values(&statistics[1]),
+            epsilon,
+            y.as_ref().map(values),
+            values(&dy),
+            &mut dx,
+            &mut dgamma,
+            &mut dbeta,
+        );
+        let found = [
+            maps(grid, dx),
+            tensor(dgamma, [channels]),
+            tensor(dbeta, [channels]),
+        ];
+        for (node, gradient) in ops.parents.into_iter().zip(found) {
+            if let Some(node) = node {
+                grads.register::<Flex>(node.id, gradient);
+            }
+        }
+    }
+}
+
+/// The way between channels first and channels last, which is back again the other way.
+#[derive(Debug)]
+enum Relayout {
+    ToNhwc,
+    ToNchw,
+}
+
+impl Backward<Flex, 1> for Relayout {
+    type State = ();
+
+    fn backward(self, ops: Ops<(), 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = grads.consume::<Flex>(&ops.node);
+        let [node] = ops.parents;
+        if let Some(node) = node {
+            let dx = match self {
+                Relayout::ToNhwc => Flex::nchw_from_nhwc(dy),
+                Relayout::ToNchw => Flex::nhwc_from_nchw(dy),
+            };
+            grads.register::<Flex>(node.id, dx);
+        }
+    }
+}
+
+#[derive(Debug)]
+struct RelMse;
+
+impl Backward<Flex, 1> for RelMse {
+    /// The loss's gradient by the output.
+    type State = FlexTensor;
+
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dloss = contiguous(grads.consume::<Flex>(&ops.node));
+        let ([node], dout) = (ops.parents, ops.state);
+        if let Some(node) = node {
+            let factor = values(&dloss)[0];
+            grads.register::<Flex>(node.id, Flex::float_mul_scalar(dout, factor.into()));
+        }
+    }
+}

@@ -1,0 +1,202 @@
+//! The kernels on `flex`.
+
+use burn::backend::Flex;
+use burn::backend::flex::FlexTensor;
+use demc_kernels::{Grid, Isa, batch_norm, conv1x1, conv3x3, deconv4x4, grid, pool, rel_mse};
+
+use super::KernelOps;
+use super::slices::{buffer, contiguous, dims, grid, maps, tensor, values};
+
+impl KernelOps for Flex {
+    fn nhwc_from_nchw(x: FlexTensor) -> FlexTensor {
+        let x = contiguous(x);
+        let [batch, channels, height, width] = dims(&x);
+        let grid = Grid {
+            batch,
+            height,
+            width,
+        };
+        let mut y = buffer(grid.pixels() * channels);
+        grid::nhwc_from_nchw(grid, values(&x), &mut y);
+        maps(grid, y)
+    }
+
+    fn nchw_from_nhwc(x: FlexTensor) -> FlexTensor {
+        let x = contiguous(x);
+        let (grid, channels) = grid(&x);
+        let mut y = buffer(grid.pixels() * channels);
+        grid::nchw_from_nhwc(grid, values(&x), &mut y);
+        tensor(y, [grid.batch, channels, grid.height, grid.width])
+    }
+
+    fn conv3x3(x: FlexTensor, weight: FlexTensor, bias: FlexTensor, relu: bool) -> FlexTensor {
+        let [x, weight, bias] = [x, weight, bias].map(contiguous);
+        let (grid, _) = grid(&x);
+        let [outputs, ..] = dims::<4>(&weight);
+        let mut y = buffer(grid.pixels() * outputs);
+        conv3x3::forward(
+            Isa::current(),
+            grid,
+            values(&x),
+            values(&weight),
+            values(&bias),
+            relu,
+            &mut y,
+        );
+        maps(grid, y)
+    }
+
+    fn deconv4x4(x: FlexTensor, weight: FlexTensor, bias: FlexTensor, relu: bool) -> FlexTensor {
+        let [x, weight, bias] = [x, weight, bias].map(contiguous);
+        let (grid, _) = grid(&x);
+        let [_, outputs, ..] = dims::<4>(&weight);
+        let mut y = buffer(grid.doubled().pixels() * outputs);
+        deconv4x4::forward(
+            Isa::current(),
+            grid,
+            values(&x),
+            values(&weight),
+            values(&bias),
+            relu,
+            &mut y,
+        );
+        maps(grid.doubled(), y)
+    }
+
+    fn fuse_two(
+        a: FlexTensor,
+        b: FlexTensor,
+        weight: FlexTensor,
+        bias: FlexTensor,
+        relu: bool,
+    ) -> FlexTensor {
+        fuse([a, b], weight, bias, relu)
+    }
+
+    fn fuse_three(
+        a: FlexTensor,
+        b: FlexTensor,
+        c: FlexTensor,
+        weight: FlexTensor,
+        bias: FlexTensor,
+        relu: bool,
+    ) -> FlexTensor {
+        fuse([a, b, c], weight, bias, relu)
+    }
+
+    fn max_pool(x: FlexTensor) -> FlexTensor {
+        let x = contiguous(x);
+        let (grid, channels) = grid(&x);
+        let mut y = buffer(grid.halved().pixels() * channels);
+        pool::forward(Isa::current(), grid, values(&x), &mut y);
+        maps(grid.halved(), y)
+    }
+
+    fn batch_norm(
+        x: FlexTensor,
+        gamma: FlexTensor,
+        beta: FlexTensor,
+        mean: FlexTensor,
+        variance: FlexTensor,
+        epsilon: f32,
+        relu: bool,
+    ) -> FlexTensor {
+        let [x, gamma, beta, mean, variance] = [x, gamma, beta, mean, variance].map(contiguous);
+        let mut y = buffer(values(&x).len());
+        batch_norm::forward_eval(
+            Isa::current(),
+            values(&x),
+            values(&gamma),
+            values(&beta),
+            values(&mean),
+            values(&variance),
+            epsilon,
+            relu,
+            &mut y,
+        );
+        tensor(y, dims::<4>(&x))
+    }
+
+    fn batch_norm_train(
+        x: FlexTensor,
+        gamma: FlexTensor,
+        beta: FlexTensor,
+        epsilon: f32,
+        relu: bool,
+    ) -> (FlexTensor, FlexTensor, FlexTensor) {
+        let [x, gamma, beta] = [x, gamma, beta].map(contiguous);
+        let [channels] = dims(&gamma);
+        let mut y = buffer(values(&x).len());
+        let [mut mean, mut variance] = [buffer(channels), buffer(channels)];
+        batch_norm::forward_train(
+            Isa::current(),
+            values(&x),
+            values(&gamma),
+            values(&beta),
+            epsilon,
+            relu,
+            &mut y,
+            &mut mean,
+            &mut variance,
+        );
+        (
+            tensor(y, dims::<4>(&x)),
+            tensor(mean, [channels]),
+            tensor(variance, [channels]),
+        )
+    }
+
+    fn rel_mse_of_gamma(
+        out_gamma: FlexTensor,
+        ref_hdr: FlexTensor,
+        gamma: f32,
+        epsilon: f32,
+    ) -> FlexTensor {
+        let [out_gamma, ref_hdr] = [out_gamma, ref_hdr].map(contiguous);
+        rel_mse_into(&out_gamma, &ref_hdr, gamma, epsilon, None)
+    }
+}
+
+/// The loss, `[1]`; its gradient by the output into `dout` where asked. Both tensors are [`contiguous`], `[B, C, H, W]`.
+pub(super) fn rel_mse_into(
+    out_gamma: &FlexTensor,
+    ref_hdr: &FlexTensor,
+    gamma: f32,
+    epsilon: f32,
+    dout: Option<&mut [f32]>,
+) -> FlexTensor {
+    let [batch, _, height, width] = dims(out_gamma);
+    let loss = rel_mse::loss(
+        Isa::current(),
+        values(out_gamma),
+        values(ref_hdr),
+        batch * height * width,
+        gamma,
+        epsilon,
+        dout,
+    );
+    tensor(vec![loss as f32], [1])
+}
+
+pub(super) fn fuse<const P: usize>(
+    parts: [FlexTensor; P],
+    weight: FlexTensor,
+    bias: FlexTensor,
+    relu: bool,
+) -> FlexTensor {
+    let parts = parts.map(contiguous);
+    let [weight, bias] = [weight, bias].map(contiguous);
+    let (grid, _) = grid(&parts[0]);
+    let [outputs, ..] = dims::<4>(&weight);
+    let mut y = buffer(grid.pixels() * outputs);
+    conv1x1::forward(
+        Isa::current(),
+        grid,
+        &parts.each_ref().map(values),
+        values(&weight),
+        values(&bias),
+        relu,
+        &mut y,
+    );
+    maps(grid, y)
+}

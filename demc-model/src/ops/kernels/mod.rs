@@ -1,0 +1,184 @@
+//! The kernels as operations of Burn: a backend extension for `flex`, plain and under autodiff.
+//!
+//! The functions here take and give Burn's tensors. Burn routes each of them to [`KernelOps`] of the backend at hand:
+//! `flex` runs the kernel on slices (`forward`), `flex` under autodiff also records how to go back (`backward`).
+//! Maps are `[B, H, W, C]`, contiguous; weights are as in weight files.
+
+mod backward;
+mod forward;
+pub(super) mod slices;
+
+use burn::backend::{Backend, Dispatch, backend_extension, tensor::FloatTensor};
+use burn::nn::BatchNorm;
+use burn::tensor::Tensor;
+
+use super::Activation;
+
+/// What a backend must have to run the kernels.
+#[backend_extension(Flex, Autodiff)]
+pub(super) trait KernelOps: Backend {
+    /// `[B, C, H, W]` to `[B, H, W, C]`.
+    fn nhwc_from_nchw(x: FloatTensor<Self>) -> FloatTensor<Self>;
+    /// `[B, H, W, C]` to `[B, C, H, W]`.
+    fn nchw_from_nhwc(x: FloatTensor<Self>) -> FloatTensor<Self>;
+    /// Weight `[out, in, 3, 3]`.
+    fn conv3x3(
+        x: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        relu: bool,
+    ) -> FloatTensor<Self>;
+    /// Weight `[in, out, 4, 4]`.
+    fn deconv4x4(
+        x: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        relu: bool,
+    ) -> FloatTensor<Self>;
+    /// Weight `[out, sum of in, 1, 1]`.
+    fn fuse_two(
+        a: FloatTensor<Self>,
+        b: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        relu: bool,
+    ) -> FloatTensor<Self>;
+    /// Weight `[out, sum of in, 1, 1]`.
+    fn fuse_three(
+        a: FloatTensor<Self>,
+        b: FloatTensor<Self>,
+        c: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        relu: bool,
+    ) -> FloatTensor<Self>;
+    /// 2x2, stride 2.
+    fn max_pool(x: FloatTensor<Self>) -> FloatTensor<Self>;
+    /// With the given statistics; never differentiated.
+    fn batch_norm(
+        x: FloatTensor<Self>,
+        gamma: FloatTensor<Self>,
+        beta: FloatTensor<Self>,
+        mean: FloatTensor<Self>,
+        variance: FloatTensor<Self>,
+        epsilon: f32,
+        relu: bool,
+    ) -> FloatTensor<Self>;
+    /// With the batch's statistics, which come second and third and have no gradient.
+    fn batch_norm_train(
+        x: FloatTensor<Self>,
+        gamma: FloatTensor<Self>,
+        beta: FloatTensor<Self>,
+        epsilon: f32,
+        relu: bool,
+    ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
+    /// Eq. 5, `[1]`; the reference has no gradient.
+    fn rel_mse_of_gamma(
+        out_gamma: FloatTensor<Self>,
+        ref_hdr: FloatTensor<Self>,
+        gamma: f32,
+        epsilon: f32,
+    ) -> FloatTensor<Self>;
+}
+
+pub(super) fn nhwc_from_nchw(x: Tensor<4>) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::nhwc_from_nchw(x.into_dispatch()))
+}
+
+pub(super) fn nchw_from_nhwc(x: Tensor<4>) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::nchw_from_nhwc(x.into_dispatch()))
+}
+
+pub(super) fn conv3x3(
+    x: Tensor<4>,
+    weight: Tensor<4>,
+    bias: Tensor<1>,
+    activation: Activation,
+) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::conv3x3(
+        x.into_dispatch(),
+        weight.into_dispatch(),
+        bias.into_dispatch(),
+        activation.is_relu(),
+    ))
+}
+
+pub(super) fn deconv4x4(
+    x: Tensor<4>,
+    weight: Tensor<4>,
+    bias: Tensor<1>,
+    activation: Activation,
+) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::deconv4x4(
+        x.into_dispatch(),
+        weight.into_dispatch(),
+        bias.into_dispatch(),
+        activation.is_relu(),
+    ))
+}
+
+pub(super) fn fuse(
+    parts: Vec<Tensor<4>>,
+    weight: Tensor<4>,
+    bias: Tensor<1>,
+    activation: Activation,
+) -> Tensor<4> {
+    let (weight, bias) = (weight.into_dispatch(), bias.into_dispatch());
+    let relu = activation.is_relu();
+    let parts: Vec<_> = parts.into_iter().map(Tensor::into_dispatch).collect();
+    let fused = match <[_; 2]>::try_from(parts) {
+        Ok([a, b]) => Dispatch::fuse_two(a, b, weight, bias, relu),
+        Err(parts) => match <[_; 3]>::try_from(parts) {
+            Ok([a, b, c]) => Dispatch::fuse_three(a, b, c, weight, bias, relu),
+            Err(parts) => panic!("{} parts: a fusion has two or three", parts.len()),
+        },
+    };
+    Tensor::from_dispatch(fused)
+}
+
+pub(super) fn max_pool(x: Tensor<4>) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::max_pool(x.into_dispatch()))
+}
+
+pub(super) fn batch_norm(x: Tensor<4>, norm: &BatchNorm, activation: Activation) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::batch_norm(
+        x.into_dispatch(),
+        norm.gamma.val().into_dispatch(),
+        norm.beta.val().into_dispatch(),
+        norm.running_mean.value().into_dispatch(),
+        norm.running_var.value().into_dispatch(),
+        norm.epsilon as f32,
+        activation.is_relu(),
+    ))
+}
+
+/// The normalised maps, and the batch's mean and variance.
+pub(super) fn batch_norm_train(
+    x: Tensor<4>,
+    norm: &BatchNorm,
+    activation: Activation,
+) -> (Tensor<4>, [Tensor<1>; 2]) {
+    let (y, mean, variance) = Dispatch::batch_norm_train(
+        x.into_dispatch(),
+        norm.gamma.val().into_dispatch(),
+        norm.beta.val().into_dispatch(),
+        norm.epsilon as f32,
+        activation.is_relu(),
+    );
+    let statistics = [mean, variance].map(Tensor::from_dispatch);
+    (Tensor::from_dispatch(y), statistics)
+}
+
+pub(super) fn rel_mse_of_gamma(
+    out_gamma: Tensor<4>,
+    ref_hdr: Tensor<4>,
+    gamma: f32,
+    epsilon: f32,
+) -> Tensor<1> {
+    Tensor::from_dispatch(Dispatch::rel_mse_of_gamma(
+        out_gamma.into_dispatch(),
+        ref_hdr.into_dispatch(),
+        gamma,
+        epsilon,
+    ))
+}
