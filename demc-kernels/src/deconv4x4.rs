@@ -10,9 +10,10 @@
 
 use rayon::prelude::*;
 
-use crate::product::padded_rows;
-use crate::rows::{self, BLOCK, Copy, Outer, Packed, Term, Window, copy, whole};
+use crate::product::{Panels, padded_rows};
+use crate::rows::{self, BLOCK, Copy, Outer, Packed, Term, copy, whole};
 use crate::scratch::{Scratch, Shared};
+use crate::simd::{Leaf, Simd, run};
 use crate::{Grid, Isa};
 
 /// The 2x2 inputs of a cell.
@@ -36,41 +37,59 @@ impl Cells {
         (self.grid.height + 1) * self.across
     }
 
-    /// Rows of a padded input of an image: a row of zeros before and after it, and what the products read beyond.
-    fn padded(self) -> usize {
-        (self.grid.height + 2) * self.across + 1
+    /// Cells of all images, one after the other.
+    fn count(self) -> usize {
+        self.grid.batch * self.of_image()
     }
 
-    /// The padded input, pixel `(y, x)` of an image at row `(y + 1) * across + x + 1`.
+    /// The padded inputs: what cell `m` reads at tap `(dy, dx)` lies at row `m + offset(tap)`.
+    ///
+    /// Every image begins with a row of zeros, which ends the one before it.
     fn inputs(self, isa: Isa, x: &[f32], channels: usize) -> Scratch {
         let Grid { batch, height, width } = self.grid;
-        let mut padded = Scratch::zeroed(batch * self.padded() * channels + padded_rows(BLOCK) * channels);
-        let images = padded.par_chunks_mut(self.padded() * channels).take(batch);
-        images.zip(x.par_chunks(height * width * channels)).for_each(|(padded, x)| {
-            for (row, x) in x.chunks(width * channels).enumerate() {
-                let first = ((row + 1) * self.across + 1) * channels;
-                padded[first..first + x.len()].copy_from_slice(x);
+        let rows = self.count() + self.across + 1;
+        let mut padded = Scratch::take((rows + padded_rows(BLOCK)) * channels);
+        let (head, lines) = padded.split_at_mut(channels);
+        head.fill(0.0);
+        lines.par_chunks_mut(self.across * channels).enumerate().for_each(|(line, to)| {
+            let (image, row) = (line / (height + 1), line % (height + 1));
+            if image >= batch || row == 0 {
+                to.fill(0.0);
+                return;
             }
+            let first = ((image * height + row - 1) * width) * channels;
+            let (pixels, border) = to.split_at_mut(width * channels);
+            copy(isa, Copy {
+                from: &x[first..], from_step: width * channels, gate: None, bias: None, relu: false,
+                to: pixels, to_step: width * channels, rows: 1, channels: width * channels,
+            });
+            border.fill(0.0);
         });
-        let _ = isa;
         padded
     }
 
-    /// First row of the padded inputs that cell 0 of an image reads at a tap.
-    fn offset(self, image: usize, (dy, dx): (usize, usize)) -> usize {
-        image * self.padded() + self.across + 1 - dy * self.across - dx
+    /// First row of the padded inputs that cell 0 reads at a tap.
+    fn offset(self, (dy, dx): (usize, usize)) -> usize {
+        (1 - dy) * self.across + 1 - dx
     }
 
-    /// The gradient by cells, `4 * channels` a cell, gated; and its sum over pixels, by rows of cells.
+    /// The gradient by cells, `4 * channels` a cell, gated; and its sum over pixels.
     fn gradients(self, isa: Isa, dy: &[f32], y: Option<&[f32]>, channels: usize) -> (Scratch, Vec<f64>) {
         let Grid { batch, height, width } = self.grid;
         let wide = whole(4 * channels);
         let lines = batch * (height + 1);
-        let mut cells = Scratch::zeroed((lines * self.across + padded_rows(BLOCK)) * wide);
+        let mut cells = Scratch::take((lines * self.across + self.across + 2 + padded_rows(BLOCK)) * wide);
+        cells[lines * self.across * wide..].fill(0.0);
         let mut sums = vec![0.0f64; lines * channels];
         let all = cells.par_chunks_mut(self.across * wide).take(lines).zip(sums.par_chunks_mut(channels));
         all.enumerate().for_each(|(line, (cells, sums))| {
             let (image, row) = (line / (height + 1), line % (height + 1));
+            if row == 0 || row == height || wide != 4 * channels {
+                cells.fill(0.0);
+            } else {
+                cells[..wide].fill(0.0);
+                cells[width * wide..].fill(0.0);
+            }
             for py in 0..2 {
                 let Some(y_row) = (2 * row + py).checked_sub(1).filter(|y| *y < 2 * height) else { continue };
                 let first = ((image * 2 * height + y_row) * 2 * width) * channels;
@@ -92,10 +111,78 @@ impl Cells {
     }
 }
 
-/// Place in a weight `[in, out, 4, 4]`.
-fn place(outputs: usize, input: usize, column: usize, (dy, dx): (usize, usize)) -> usize {
-    let (phase, output) = (column / outputs, column % outputs);
-    (input * outputs + output) * 16 + (2 * dy + phase / 2) * 4 + 2 * dx + phase % 2
+/// Packs a weight `[in, out, 4, 4]` by taps: some inputs' rows of `in x 4 out` matrices, or transposed some outputs'
+/// of `4 out x in`.
+struct Pack<'a> {
+    weight: &'a [f32],
+    inputs: usize,
+    outputs: usize,
+    transposed: bool,
+    /// Inputs, or outputs where transposed.
+    range: std::ops::Range<usize>,
+    to: [Shared; 4],
+}
+
+impl Leaf for Pack<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        const WIDEST: usize = 16;
+        let Pack { inputs, outputs, transposed, .. } = self;
+        let (depth, columns, lanes_of) = match transposed {
+            false => (inputs, 4 * outputs, outputs),
+            true => (4 * outputs, inputs, inputs),
+        };
+        let panels = Panels::new::<S>(columns);
+        for index in self.range {
+            for first in (0..lanes_of).step_by(S::LANES) {
+                let count = S::LANES.min(lanes_of - first);
+                let mut taps = [[0.0; WIDEST]; 16];
+                for lane in 0..count {
+                    let (input, output) = if transposed { (first + lane, index) } else { (index, first + lane) };
+                    let from = (input * outputs + output) * 16;
+                    for (values, weight) in taps.iter_mut().zip(&self.weight[from..from + 16]) {
+                        values[lane] = *weight;
+                    }
+                }
+                for (t, values) in taps.iter().enumerate() {
+                    let (y, x) = (t / 4, t % 4);
+                    let (tap, phase) = (y / 2 * 2 + x / 2, y % 2 * 2 + x % 2);
+                    let to = self.to[tap].pointer();
+                    let (row, column) = if transposed { (phase * outputs + index, first) } else { (index, phase * outputs + first) };
+                    // SAFETY: the row of this index is this leaf's; vectors and columns lie within the operand.
+                    unsafe {
+                        if column % S::LANES == 0 && (count == S::LANES || transposed) {
+                            S::store(to.add(panels.place(depth, row, column)), S::load(values.as_ptr()));
+                        } else {
+                            for (lane, value) in values[..count].iter().enumerate() {
+                                *to.add(panels.place(depth, row, column + lane)) = *value;
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// The four matrices of a weight, of [`TAPS`].
+fn packed(isa: Isa, weight: &[f32], inputs: usize, outputs: usize, transposed: bool) -> [Packed; 4] {
+    let (depth, columns, count) = match transposed {
+        false => (inputs, 4 * outputs, inputs),
+        true => (4 * outputs, inputs, outputs),
+    };
+    let mut packed = TAPS.map(|_| Packed::empty(depth, columns));
+    let [a, b, c, d] = &mut packed;
+    let to = [a.values(), b.values(), c.values(), d.values()];
+    let step = (2048 / (inputs * outputs / count)).max(1);
+    (0..count.div_ceil(step)).into_par_iter().for_each(|task| {
+        let range = task * step..((task + 1) * step).min(count);
+        // SAFETY: tasks write different rows.
+        unsafe { run(isa, Pack { weight, inputs, outputs, transposed, range, to }) };
+    });
+    packed
 }
 
 /// `y = x * weight + bias`, rectified where `relu`.
@@ -117,18 +204,16 @@ pub fn forward(
 ) {
     let (inputs, outputs) = check(grid, x.len(), weight.len(), bias.len(), y.len());
     let cells = Cells::new(grid);
-    let weights = TAPS.map(|tap| Packed::new(isa, inputs, 4 * outputs, |k, column| weight[place(outputs, k, column, tap)]));
+    let weights = packed(isa, weight, inputs, outputs, false);
     let padded = cells.inputs(isa, x, inputs);
     let wide = whole(4 * outputs);
-    let step = if wide > 512 { BLOCK / 2 } else { BLOCK };
-    let of_image = cells.of_image();
-    let blocks = of_image.div_ceil(step);
+    let step = rows::block_rows(cells.count());
     let shared = Shared::new(y);
-    (0..grid.batch * blocks).into_par_iter().for_each(|task| {
-        let (image, first) = (task / blocks, task % blocks * step);
-        let count = step.min(of_image - first);
+    (0..cells.count().div_ceil(step)).into_par_iter().for_each(|task| {
+        let first = task * step;
+        let count = step.min(cells.count() - first);
         let terms: [Term; 4] = std::array::from_fn(|t| Term {
-            rows: &padded[(cells.offset(image, TAPS[t]) + first) * inputs..],
+            rows: &padded[(cells.offset(TAPS[t]) + first) * inputs..],
             step: inputs,
             weight: &weights[t],
         });
@@ -137,7 +222,8 @@ pub fn forward(
         // The cells of a row lie side by side in two rows of the output.
         let mut cell = first;
         while cell < first + count {
-            let (row, column) = (cell / cells.across, cell % cells.across);
+            let (line, column) = (cell / cells.across, cell % cells.across);
+            let (image, row) = (line / (grid.height + 1), line % (grid.height + 1));
             let run = (cells.across - column).min(first + count - cell);
             for phase in 0..4 {
                 let (py, px) = (phase / 2, phase % 2);
@@ -152,7 +238,7 @@ pub fn forward(
                 let pixel = (image * 2 * grid.height + y_row) * 2 * grid.width + 2 * (column + skipped) + px - 1;
                 let len = ((rows - 1) * 2 + 1) * outputs;
                 // SAFETY: tasks write the pixels of different cells, and a phase is one pixel of a cell; the slice spans
-                // pixels of other phases too, which nobody but this task's own loop writes through it.
+                // pixels of other phases too, which nobody but this task's own loop writes meanwhile.
                 let to = unsafe { std::slice::from_raw_parts_mut(shared.pointer().add(pixel * outputs), len) };
                 copy(isa, Copy {
                     from: &c[(cell - first + skipped) * wide + phase * outputs..], from_step: wide, gate: None,
@@ -194,70 +280,61 @@ pub fn backward(
     for (dbias, sum) in dbias.iter_mut().zip(sums) {
         *dbias = sum as f32;
     }
-    let of_image = cells.of_image();
 
     if let Some(dx) = dx {
         assert_eq!(dx.len(), x.len(), "an input's gradient");
-        let weights = TAPS.map(|tap| Packed::new(isa, 4 * outputs, inputs, |column, k| weight[place(outputs, k, column, tap)]));
+        let weights = packed(isa, weight, inputs, outputs, true);
         let c_step = whole(inputs);
-        // Whole rows of cells, about a block of them.
-        let lines = (BLOCK / cells.across).clamp(1, grid.height);
-        let tasks = grid.height.div_ceil(lines);
+        let step = rows::block_rows(cells.count());
         let shared = Shared::new(dx);
-        (0..grid.batch * tasks).into_par_iter().for_each(|task| {
-            let (image, line) = (task / tasks, task % tasks * lines);
-            let lines = lines.min(grid.height - line);
-            let count = lines * cells.across - 1;
-            let windows: [Window; 4] = std::array::from_fn(|t| {
+        (0..cells.count().div_ceil(step)).into_par_iter().for_each(|task| {
+            let first = task * step;
+            let count = step.min(cells.count() - first);
+            let terms: [Term; 4] = std::array::from_fn(|t| {
                 let (dy, dx) = TAPS[t];
-                Window::new(&gradients, wide, image * of_image + (line + dy) * cells.across + dx, count)
+                Term { rows: &gradients[(first + dy * cells.across + dx) * wide..], step: wide, weight: &weights[t] }
             });
-            let terms: [Term; 4] = std::array::from_fn(|t| Term { rows: windows[t].rows(), step: wide, weight: &weights[t] });
             let mut c = Scratch::take(padded_rows(count) * c_step);
             rows::sum(isa, count, &terms, &mut c, c_step);
-            for row in 0..lines {
-                let first = (image * grid.height + line + row) * grid.width * inputs;
-                // SAFETY: tasks write different rows of `dx`.
-                let to = unsafe { std::slice::from_raw_parts_mut(shared.pointer().add(first), grid.width * inputs) };
-                copy(isa, Copy {
-                    from: &c[row * cells.across * c_step..], from_step: c_step, gate: None, bias: None, relu: false,
-                    to, to_step: inputs, rows: grid.width, channels: inputs,
-                });
+            // Of the cells of a row all but the last are pixels of the input, of the rows all but the last.
+            let mut cell = first;
+            while cell < first + count {
+                let (line, column) = (cell / cells.across, cell % cells.across);
+                let (image, row) = (line / (grid.height + 1), line % (grid.height + 1));
+                let run = (cells.across - column).min(first + count - cell);
+                let rows = run.min(grid.width - column);
+                if row < grid.height && rows > 0 {
+                    let pixel = (image * grid.height + row) * grid.width + column;
+                    // SAFETY: tasks write different pixels.
+                    let to = unsafe { std::slice::from_raw_parts_mut(shared.pointer().add(pixel * inputs), rows * inputs) };
+                    copy(isa, Copy {
+                        from: &c[(cell - first) * c_step..], from_step: c_step, gate: None, bias: None, relu: false,
+                        to, to_step: inputs, rows, channels: inputs,
+                    });
+                }
+                cell += run;
             }
         });
     }
 
     let padded = cells.inputs(isa, x, inputs);
-    let mut sum: Option<Scratch> = None;
-    for image in 0..grid.batch {
-        let outers = TAPS.map(|tap| Outer {
-            a: &padded[cells.offset(image, tap) * inputs..],
-            a_step: inputs,
-            rows: inputs,
-            b: &gradients[image * of_image * wide..],
-            b_step: wide,
-            columns: 4 * outputs,
-            pixels: of_image,
-        });
-        let products = rows::outer(isa, &outers, wide);
-        match &mut sum {
-            None => sum = Some(products),
-            Some(sum) => {
-                sum.par_chunks_mut(1 << 14).zip(products.par_chunks(1 << 14)).for_each(|(sum, product)| {
-                    for (sum, product) in sum.iter_mut().zip(product) {
-                        *sum += product;
-                    }
-                });
-            }
-        }
-    }
-    let Some(sum) = sum else { return };
+    let outers = TAPS.map(|tap| Outer {
+        a: &padded[cells.offset(tap) * inputs..],
+        a_step: inputs,
+        rows: inputs,
+        b: &gradients,
+        b_step: wide,
+        columns: 4 * outputs,
+        pixels: cells.count(),
+    });
+    let products = rows::outer(isa, &outers, wide);
     let size = padded_rows(inputs) * wide;
     dweight.par_chunks_mut(outputs * 16).enumerate().for_each(|(input, dweight)| {
-        for (t, tap) in TAPS.into_iter().enumerate() {
-            let row = &sum[t * size + input * wide..][..4 * outputs];
-            for (column, value) in row.iter().enumerate() {
-                dweight[place(outputs, 0, column, tap)] = *value;
+        let rows: [&[f32]; 4] = std::array::from_fn(|t| &products[t * size + input * wide..][..4 * outputs]);
+        for (output, dweight) in dweight.chunks_exact_mut(16).enumerate() {
+            for (t, dweight) in dweight.iter_mut().enumerate() {
+                let (y, x) = (t / 4, t % 4);
+                *dweight = rows[y / 2 * 2 + x / 2][(y % 2 * 2 + x % 2) * outputs + output];
             }
         }
     });

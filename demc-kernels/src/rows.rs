@@ -72,6 +72,22 @@ impl Packed {
         });
         Packed { depth, columns, values }
     }
+
+    /// A weight `[depth, columns]` whose packed values the caller writes.
+    pub(crate) fn empty(depth: usize, columns: usize) -> Self {
+        Packed { depth, columns, values: Scratch::take(depth * whole(columns)) }
+    }
+
+    /// The packed values; see [`Panels::place`].
+    pub(crate) fn values(&mut self) -> Shared {
+        Shared::new(&mut self.values)
+    }
+}
+
+/// Rows of a block, at most [`BLOCK`], of which there are enough for all threads.
+pub(crate) fn block_rows(rows: usize) -> usize {
+    let blocks = rows.div_ceil(BLOCK).next_multiple_of(rayon::current_num_threads());
+    rows.div_ceil(blocks)
 }
 
 /// One term of a sum of products: rows from `start`, `step` values apart, times a weight.
