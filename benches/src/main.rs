@@ -12,10 +12,12 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context, bail};
+use burn::tensor::Device;
 use clap::{Args, Parser, Subcommand};
 use demc_bench::case::{self, Input};
 use demc_bench::contender::{Inference, Training};
 use demc_infer::{Bundle, device};
+use demc_model::ops::{self, Isa, Ops};
 use serde_json::{Value, json};
 
 /// Steps of a check: the third loss sees what two steps made of the weights.
@@ -75,6 +77,23 @@ struct How {
     /// Where to compute: flex, ndarray, wgpu[:N], cuda[:N]
     #[arg(long, default_value = "flex")]
     device: String,
+    /// Operations on flex: kernels (the project's own) or burn
+    #[arg(long, default_value_t)]
+    ops: Ops,
+    /// Instructions of the kernels: avx512, avx2, neon, portable; default: the best of this machine
+    #[arg(long)]
+    isa: Option<Isa>,
+}
+
+impl How {
+    /// Makes it so, and gives the device.
+    fn choose(&self) -> anyhow::Result<Device> {
+        ops::set_default(self.ops);
+        if let Some(isa) = self.isa {
+            Isa::force(isa);
+        }
+        Ok(device::parse(&self.device)?)
+    }
 }
 
 fn main() {
@@ -91,10 +110,10 @@ fn run(command: Command) -> anyhow::Result<()> {
             case::write(&case::network(width), &files.weights, &input, &files.inputs)
         }
         Command::Train { files, how, lr } => {
-            let device = device::parse(&how.device)?;
+            let device = how.choose()?;
             let (bundle, input) = files.read()?;
             let mut training = Training::new(bundle, input, lr, &device);
-            serve(&how, |request| match request {
+            serve(&how, &device, |request| match request {
                 Request::Check(_) => {
                     let steps: Vec<_> = (0..CHECK_STEPS).map(|_| training.run()).collect();
                     let losses: Vec<f64> = steps.iter().map(|step| step.loss).collect();
@@ -108,11 +127,11 @@ fn run(command: Command) -> anyhow::Result<()> {
             })
         }
         Command::Infer { files, how } => {
-            let device = device::parse(&how.device)?;
+            let device = how.choose()?;
             let (bundle, input) = files.read()?;
             let size = [input.batch.size, input.height, input.width];
             let inference = Inference::new(bundle, input, &device);
-            serve(&how, |request| match request {
+            serve(&how, &device, |request| match request {
                 Request::Check(path) => {
                     let out = inference.run();
                     let zeros = out.iter().filter(|x| **x == 0.0).count();
@@ -131,7 +150,7 @@ fn run(command: Command) -> anyhow::Result<()> {
 impl Files {
     fn read(&self) -> anyhow::Result<(Bundle, Input)> {
         // On the host's backend, which every build has; the contender moves it.
-        let bundle = Bundle::load(&self.weights, &burn::tensor::Device::flex())?;
+        let bundle = Bundle::load(&self.weights, &Device::flex())?;
         Ok((bundle, case::read_input(&self.inputs)?))
     }
 }
@@ -145,6 +164,7 @@ enum Request<'a> {
 /// Answers commands until stdin ends.
 fn serve(
     how: &How,
+    device: &Device,
     mut answer: impl FnMut(Request) -> anyhow::Result<Value>,
 ) -> anyhow::Result<()> {
     let say = |value: Value| -> anyhow::Result<()> {
@@ -152,7 +172,12 @@ fn serve(
         writeln!(stdout, "{value}")?;
         Ok(stdout.flush()?)
     };
-    let about = format!("demc {} ({})", env!("CARGO_PKG_VERSION"), how.device);
+    let version = env!("CARGO_PKG_VERSION");
+    let about = format!(
+        "demc {version} ({}: {})",
+        how.device,
+        how.ops.describe(device)
+    );
     say(json!({"ready": about}))?;
     for line in std::io::stdin().lock().lines() {
         let line = line?;
