@@ -21,7 +21,7 @@ import time
 from pathlib import Path
 from typing import Callable
 
-sys.path.insert(0, str(Path(os.environ.get("DEMC_PYTHON_PACKAGE", Path(__file__).parents[2] / "python"))))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "python"))
 
 NAMES = ("color_gamma", "features_z")
 CHECK_STEPS = 3  # the third loss sees what two steps made of the weights
