@@ -5,6 +5,15 @@
 use crate::winograd::{self, Finish};
 use crate::{Grid, Isa, thin};
 
+/// Tiles of the Winograd transforms.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tile {
+    /// F(2x2, 3x3): 2.25 times fewer multiplications, as exact as the plain sum. For training.
+    F2,
+    /// F(4x4, 3x3): 4 times fewer, within 2e-5 of the largest value. For inference.
+    F4,
+}
+
 /// Channels from which on Winograd's transforms pay.
 const WINOGRAD_CHANNELS: usize = 8;
 
@@ -32,13 +41,39 @@ pub fn forward(
     relu: bool,
     y: &mut [f32],
 ) {
+    forward_with(isa, Tile::F2, grid, x, weight, bias, relu, y);
+}
+
+/// [`forward`] with tiles of a given size.
+///
+/// # Panics
+/// Where the lengths do not fit.
+#[allow(clippy::too_many_arguments, reason = "what a convolution is made of")]
+pub fn forward_with(
+    isa: Isa,
+    tile: Tile,
+    grid: Grid,
+    x: &[f32],
+    weight: &[f32],
+    bias: &[f32],
+    relu: bool,
+    y: &mut [f32],
+) {
     let (inputs, outputs) = check(grid, x.len(), weight.len(), bias.len(), y.len());
     let finish = Finish { bias: Some(bias), relu };
-    if is_wide(inputs, outputs) {
-        let weights = winograd::Weights::new::<TILE>(isa, weight, outputs, inputs, false);
-        winograd::convolve::<TILE>(grid, x, None, &weights, finish, y);
-    } else {
-        thin::convolve(isa, grid, x, None, weight, thin::Axes::new(outputs, inputs, false), finish, y);
+    if !is_wide(inputs, outputs) {
+        let axes = thin::Axes::new(outputs, inputs, false);
+        return thin::convolve(isa, grid, x, None, weight, axes, finish, y);
+    }
+    match tile {
+        Tile::F2 => {
+            let weights = winograd::Weights::new::<4>(isa, weight, outputs, inputs, false);
+            winograd::convolve::<4>(grid, x, None, &weights, finish, y);
+        }
+        Tile::F4 => {
+            let weights = winograd::Weights::new::<6>(isa, weight, outputs, inputs, false);
+            winograd::convolve::<6>(grid, x, None, &weights, finish, y);
+        }
     }
 }
 
