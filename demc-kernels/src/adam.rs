@@ -48,9 +48,15 @@ pub fn step(
     let moments = first.chunks_mut(TASK).zip(second.chunks_mut(TASK));
     let pieces = weight.chunks_mut(TASK).zip(grad.chunks(TASK)).zip(moments);
     tasks::each(pieces, |((weight, grad), (first, second))| {
-        let leaf = Step { factors, weight, grad, first, second };
+        let leaf = Step {
+            factors,
+            weight,
+            grad,
+            first,
+            second,
+        };
         // SAFETY: the leaf has slices only.
-        unsafe { simd::run(isa, leaf) }
+        unsafe { simd::run(tasks::streaming(isa), leaf) }
     });
 }
 
@@ -100,7 +106,8 @@ impl Leaf for Step<'_> {
     unsafe fn run<S: Simd>(self) {
         let f = self.factors;
         let moments = self.first.iter_mut().zip(self.second);
-        for ((weight, grad), (first, second)) in self.weight.iter_mut().zip(self.grad).zip(moments) {
+        for ((weight, grad), (first, second)) in self.weight.iter_mut().zip(self.grad).zip(moments)
+        {
             *first = *first * f.beta_1 + grad * f.rest_1;
             *second = *second * f.beta_2 + grad * grad * f.rest_2;
             *weight -= *first * f.correction / (second.sqrt() + f.epsilon) * f.lr;
@@ -111,15 +118,29 @@ impl Leaf for Step<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tasks::tests::{assert_close, bits, pattern, same_on_any_number_of_threads};
+    use crate::testing::{assert_within, bits, pattern, same_on_any_number_of_threads};
 
-    const RULE: Adam = Adam { lr: 1e-2, beta_1: 0.9, beta_2: 0.999, epsilon: 1e-8 };
+    const RULE: Adam = Adam {
+        lr: 1e-2,
+        beta_1: 0.9,
+        beta_2: 0.999,
+        epsilon: 1e-8,
+    };
 
     /// Weight and moments after `steps` steps.
     fn run(isa: Isa, size: usize, steps: u64) -> [Vec<f32>; 3] {
-        let (mut weight, mut first, mut second) = (pattern(size, 1), vec![0.0; size], vec![0.0; size]);
+        let (mut weight, mut first, mut second) =
+            (pattern(size, 1), vec![0.0; size], vec![0.0; size]);
         for t in 1..=steps {
-            step(isa, &RULE, t, &mut weight, &pattern(size, 1 + t as u32), &mut first, &mut second);
+            step(
+                isa,
+                &RULE,
+                t,
+                &mut weight,
+                &pattern(size, 1 + t as u32),
+                &mut first,
+                &mut second,
+            );
         }
         [weight, first, second]
     }
@@ -128,12 +149,16 @@ mod tests {
     fn paper(size: usize, steps: u64) -> [Vec<f64>; 3] {
         let of = |values: Vec<f32>| -> Vec<f64> { values.into_iter().map(f64::from).collect() };
         let [lr, b1, b2, epsilon] = [1e-2, 0.9, 0.999, 1e-8];
-        let (mut weight, mut first, mut second) = (of(pattern(size, 1)), vec![0.0; size], vec![0.0; size]);
+        let (mut weight, mut first, mut second) =
+            (of(pattern(size, 1)), vec![0.0; size], vec![0.0; size]);
         for t in 1..=steps {
             for (i, g) in of(pattern(size, 1 + t as u32)).into_iter().enumerate() {
                 first[i] = b1 * first[i] + (1.0 - b1) * g;
                 second[i] = b2 * second[i] + (1.0 - b2) * g * g;
-                let hat = (first[i] / (1.0 - b1.powi(t as i32)), second[i] / (1.0 - b2.powi(t as i32)));
+                let hat = (
+                    first[i] / (1.0 - b1.powi(t as i32)),
+                    second[i] / (1.0 - b2.powi(t as i32)),
+                );
                 weight[i] -= lr * hat.0 / (f64::sqrt(hat.1) + epsilon);
             }
         }
@@ -142,13 +167,13 @@ mod tests {
 
     /// Three roundings a step of values of order 1, and decays that float32 holds to 1e-8 of 1 - 0.999.
     #[test]
+    #[cfg_attr(miri, ignore = "its powi is off at random")]
     fn steps_are_those_of_the_paper() {
         for size in [1, 5, 16, 129, TASK + 3] {
-            let size = if cfg!(miri) { size.min(129) } else { size };
             let expected = paper(size, 4);
             for isa in Isa::available() {
                 for (found, expected) in run(isa, size, 4).iter().zip(&expected) {
-                    assert_close(found, expected, 1e-6, &format!("{isa}, {size} values"));
+                    assert_within(&format!("{isa}, {size} values"), found, expected, 1e-6);
                 }
             }
         }
@@ -156,9 +181,11 @@ mod tests {
 
     /// The tensor operations of burn-optim 0.22.1's `AdaptiveMomentum::transform`, one by one.
     #[test]
+    #[cfg_attr(miri, ignore = "its powi is off at random")]
     fn bits_are_those_of_burns_operations() {
         let size = 133;
-        let (mut weight, mut first, mut second) = (pattern(size, 1), vec![0.0f32; size], vec![0.0f32; size]);
+        let (mut weight, mut first, mut second) =
+            (pattern(size, 1), vec![0.0f32; size], vec![0.0f32; size]);
         for t in 1..=3i32 {
             for (i, g) in pattern(size, 1 + t as u32).into_iter().enumerate() {
                 let (scaled, decayed) = (g * (1.0 - RULE.beta_1), first[i] * RULE.beta_1);
@@ -173,13 +200,17 @@ mod tests {
         }
         let expected = [weight, first, second].map(|values| bits(&values));
         for isa in Isa::available() {
-            assert!(run(isa, size, 3).map(|values| bits(&values)) == expected, "{isa}");
+            assert!(
+                run(isa, size, 3).map(|values| bits(&values)) == expected,
+                "{isa}"
+            );
         }
     }
 
     #[test]
+    #[cfg_attr(miri, ignore = "its powi is off at random")]
     fn bits_do_not_depend_on_the_threads() {
-        let size = if cfg!(miri) { TASK + 1 } else { 3 * TASK + 5 };
+        let size = 3 * TASK + 5;
         for isa in Isa::available() {
             same_on_any_number_of_threads(|| run(isa, size, 1).map(|values| bits(&values)));
         }
@@ -189,7 +220,15 @@ mod tests {
     fn a_gradient_that_is_no_number_reaches_the_weight() {
         for isa in Isa::available() {
             let mut weight = [1.0; 3];
-            step(isa, &RULE, 1, &mut weight, &[0.0, f32::NAN, 1.0], &mut [0.0; 3], &mut [0.0; 3]);
+            step(
+                isa,
+                &RULE,
+                1,
+                &mut weight,
+                &[0.0, f32::NAN, 1.0],
+                &mut [0.0; 3],
+                &mut [0.0; 3],
+            );
             assert!(weight[0] == 1.0 && weight[1].is_nan() && weight[2].is_finite());
         }
     }
@@ -197,6 +236,14 @@ mod tests {
     #[test]
     #[should_panic(expected = "of a weight of 2 values")]
     fn lengths_are_checked() {
-        step(Isa::Portable, &RULE, 1, &mut [0.0; 2], &[0.0; 3], &mut [0.0; 2], &mut [0.0; 2]);
+        step(
+            Isa::Portable,
+            &RULE,
+            1,
+            &mut [0.0; 2],
+            &[0.0; 3],
+            &mut [0.0; 2],
+            &mut [0.0; 2],
+        );
     }
 }

@@ -6,12 +6,19 @@
 //!
 //! NaN and infinite values reach the output: ReLU lets NaN through.
 
+mod passes;
+
+use passes::{GradientSums, InputGradient, Moments, Normalize};
+
 use crate::Isa;
-use crate::simd::{self, Leaf, Simd};
+use crate::simd;
 use crate::tasks::{self, TASK};
 
-/// Least values of a row; also the least number of pixels in a row is a multiple of 16, which fills vectors.
+/// Least values of a row.
 const ROW: usize = 512;
+
+/// Values of a block, about: 128 KiB, which a core's own cache holds for a second look.
+const BLOCK: usize = 2 * TASK;
 
 /// Normalises by the batch's own statistics: `y = (x - mean) / sqrt(variance + epsilon) * gamma + beta`, rectified where
 /// asked, and returns them: the mean and the biased variance over all pixels, by channel.
@@ -33,7 +40,11 @@ pub fn forward_train(
     mean: &mut [f32],
     variance: &mut [f32],
 ) {
-    check(x.len(), gamma.len(), &[beta.len(), mean.len(), variance.len()]);
+    check(
+        x.len(),
+        gamma.len(),
+        &[beta.len(), mean.len(), variance.len()],
+    );
     statistics(isa, x, mean, variance);
     forward_eval(isa, x, gamma, beta, mean, variance, epsilon, relu, y);
 }
@@ -66,9 +77,16 @@ pub fn forward_eval(
     let [mean, scale, beta] = [&mean[..], &scale, &beta];
     let pieces = x.chunks(rows.block).zip(y.chunks_mut(rows.block));
     tasks::each(pieces, |(x, y)| {
-        let leaf = Normalize { x, mean, scale, beta, relu, y };
+        let leaf = Normalize {
+            x,
+            mean,
+            scale,
+            beta,
+            relu,
+            y,
+        };
         // SAFETY: the leaf has slices only.
-        unsafe { simd::run(isa, leaf) }
+        unsafe { simd::run(tasks::streaming(isa), leaf) }
     });
 }
 
@@ -95,19 +113,39 @@ pub fn backward(
     dbeta: &mut [f32],
 ) {
     let channels = gamma.len();
-    check(x.len(), channels, &[mean.len(), variance.len(), dgamma.len(), dbeta.len()]);
+    check(
+        x.len(),
+        channels,
+        &[mean.len(), variance.len(), dgamma.len(), dbeta.len()],
+    );
     let maps = [y.map_or(x.len(), <[f32]>::len), dy.len(), dx.len()];
-    assert_eq!(maps, [x.len(); 3], "y, dy and dx beside a map of {} values", x.len());
+    assert_eq!(
+        maps,
+        [x.len(); 3],
+        "y, dy and dx beside a map of {} values",
+        x.len()
+    );
     // Without a ReLU any map does as `y`.
     let (gated, y) = (y.is_some(), y.unwrap_or(dy));
 
     let rows = Rows::new(x.len(), channels);
     let means = &rows.repeated(mean)[..];
-    let maps = || x.chunks(rows.block).zip(y.chunks(rows.block)).zip(dy.chunks(rows.block));
+    let maps = || {
+        x.chunks(rows.block)
+            .zip(y.chunks(rows.block))
+            .zip(dy.chunks(rows.block))
+    };
     let sums = tasks::map(maps(), |((x, y), dy)| {
-        let leaf = GradientSums { x, y, dy, gated, mean: means, channels };
+        let leaf = GradientSums {
+            x,
+            y,
+            dy,
+            gated,
+            mean: means,
+            channels,
+        };
         // SAFETY: the leaf has slices only.
-        unsafe { simd::run(isa, leaf) }
+        unsafe { simd::run(tasks::streaming(isa), leaf) }
     });
 
     // With g = dy behind the gate, n pixels and s = 1 / sqrt(variance + epsilon):
@@ -127,11 +165,24 @@ pub fn backward(
     }
     let [scale, slope, shift] = [&scale, &slope, &shift].map(|values| rows.repeated(values));
     let [scale, slope, shift] = [&scale[..], &slope, &shift];
-    tasks::each(maps().zip(dx.chunks_mut(rows.block)), |(((x, y), dy), dx)| {
-        let leaf = InputGradient { x, y, dy, gated, mean: means, scale, slope, shift, dx };
-        // SAFETY: the leaf has slices only.
-        unsafe { simd::run(isa, leaf) }
-    });
+    tasks::each(
+        maps().zip(dx.chunks_mut(rows.block)),
+        |(((x, y), dy), dx)| {
+            let leaf = InputGradient {
+                x,
+                y,
+                dy,
+                gated,
+                mean: means,
+                scale,
+                slope,
+                shift,
+                dx,
+            };
+            // SAFETY: the leaf has slices only.
+            unsafe { simd::run(tasks::streaming(isa), leaf) }
+        },
+    );
 }
 
 #[track_caller]
@@ -141,7 +192,10 @@ fn check(len: usize, channels: usize, parameters: &[usize]) {
         "{len} values are no map of {channels} channels"
     );
     for found in parameters {
-        assert_eq!(*found, channels, "a parameter's length for {channels} channels");
+        assert_eq!(
+            *found, channels,
+            "a parameter's length for {channels} channels"
+        );
     }
 }
 
@@ -167,10 +221,20 @@ struct Rows {
 
 impl Rows {
     fn new(len: usize, channels: usize) -> Self {
-        let width = channels * ROW.div_ceil(channels).next_multiple_of(16);
+        let pixels = ROW.div_ceil(channels);
+        // Short pixels that fill no vectors do so 16 at a time.
+        let odd = channels < ROW / 4 && !channels.is_multiple_of(16);
+        let pixels = if odd {
+            pixels.next_multiple_of(16)
+        } else {
+            pixels
+        };
         // One row is enough for a map that is shorter.
-        let width = width.min(len);
-        Rows { width, block: width * (TASK / width).max(1) }
+        let width = (channels * pixels).min(len);
+        Rows {
+            width,
+            block: width * (BLOCK / width).max(1),
+        }
     }
 
     /// A parameter by channel, for each value of a row.
@@ -185,13 +249,26 @@ fn statistics(isa: Isa, x: &[f32], mean: &mut [f32], variance: &mut [f32]) {
     let rows = Rows::new(x.len(), channels);
     let blocks = tasks::map(x.chunks(rows.block), |x| {
         // SAFETY: the leaf has slices only.
-        unsafe { simd::run(isa, Moments { x, width: rows.width, channels }) }
+        unsafe {
+            simd::run(
+                tasks::streaming(isa),
+                Moments {
+                    x,
+                    width: rows.width,
+                    channels,
+                },
+            )
+        }
     });
     // Combined as by Chan, Golub and LeVeque (1983): no difference of large sums.
     let pixels = (x.len() / channels) as f64;
     let counts = || x.chunks(rows.block).map(|x| (x.len() / channels) as f64);
     for c in 0..channels {
-        let sum: f64 = blocks.iter().zip(counts()).map(|(block, count)| block[c][0] * count).sum();
+        let sum: f64 = blocks
+            .iter()
+            .zip(counts())
+            .map(|(block, count)| block[c][0] * count)
+            .sum();
         let center = sum / pixels;
         let squares = blocks.iter().zip(counts()).map(|(block, count)| {
             block[c][1] + count * (block[c][0] - center) * (block[c][0] - center)
@@ -201,188 +278,27 @@ fn statistics(isa: Isa, x: &[f32], mean: &mut [f32], variance: &mut [f32]) {
     }
 }
 
-/// The sums of the columns of a row by channel.
-fn by_channel(columns: &[f32], channels: usize) -> Vec<f64> {
-    let mut sums = vec![0.0; channels];
-    for pixel in columns.chunks(channels) {
-        for (sum, value) in sums.iter_mut().zip(pixel) {
-            *sum += f64::from(*value);
-        }
-    }
-    sums
-}
-
-/// Mean of each channel of a block, and the sum of squared distances from it.
-struct Moments<'a> {
-    x: &'a [f32],
-    width: usize,
-    channels: usize,
-}
-
-impl Leaf for Moments<'_> {
-    type Out = Vec<[f64; 2]>;
-
-    /// Twice over a block that the cache holds: a mean, then the distances from it, whose sum corrects it.
-    #[inline(always)]
-    unsafe fn run<S: Simd>(self) -> Vec<[f64; 2]> {
-        let pixels = (self.x.len() / self.channels) as f64;
-        let mut sums = vec![0.0; self.width];
-        for x in self.x.chunks(self.width) {
-            for (sum, x) in sums.iter_mut().zip(x) {
-                *sum += x;
-            }
-        }
-        let near: Vec<f32> =
-            by_channel(&sums, self.channels).iter().map(|sum| (sum / pixels) as f32).collect();
-        let center: Vec<f32> = near.iter().copied().cycle().take(self.width).collect();
-        sums.fill(0.0);
-        let mut squares = vec![0.0; self.width];
-        for x in self.x.chunks(self.width) {
-            for (((sum, square), x), center) in sums.iter_mut().zip(&mut squares).zip(x).zip(&center) {
-                let distance = x - center;
-                *sum += distance;
-                *square += distance * distance;
-            }
-        }
-        let sums = by_channel(&sums, self.channels);
-        let moments = sums.iter().zip(by_channel(&squares, self.channels)).zip(near);
-        moments
-            .map(|((sum, square), near)| {
-                let square = square - sum * sum / pixels;
-                // Rounding may leave a little below 0; NaN stays.
-                let square = if square < 0.0 { 0.0 } else { square };
-                [f64::from(near) + sum / pixels, square]
-            })
-            .collect()
-    }
-}
-
-struct Normalize<'a> {
-    x: &'a [f32],
-    mean: &'a [f32],
-    scale: &'a [f32],
-    beta: &'a [f32],
-    relu: bool,
-    y: &'a mut [f32],
-}
-
-impl Normalize<'_> {
-    #[inline(always)]
-    fn rows(self, rectify: impl Fn(f32) -> f32) {
-        let width = self.mean.len();
-        for (x, y) in self.x.chunks(width).zip(self.y.chunks_mut(width)) {
-            let parameters = self.mean.iter().zip(self.scale).zip(self.beta);
-            for ((x, y), ((mean, scale), beta)) in x.iter().zip(y).zip(parameters) {
-                *y = rectify((x - mean) * scale + beta);
-            }
-        }
-    }
-}
-
-impl Leaf for Normalize<'_> {
-    type Out = ();
-
-    #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
-        if self.relu {
-            self.rows(|value| if value < 0.0 { 0.0 } else { value });
-        } else {
-            self.rows(|value| value);
-        }
-    }
-}
-
-/// `dy` behind the gate of a ReLU whose output is `y`.
-#[inline(always)]
-fn gate(dy: f32, y: f32) -> f32 {
-    if y > 0.0 { dy } else { 0.0 }
-}
-
-/// Sums of a block by channel: of `g`, and of `g (x - mean)`.
-struct GradientSums<'a> {
-    x: &'a [f32],
-    y: &'a [f32],
-    dy: &'a [f32],
-    gated: bool,
-    mean: &'a [f32],
-    channels: usize,
-}
-
-impl GradientSums<'_> {
-    #[inline(always)]
-    fn rows(self, gate: impl Fn(f32, f32) -> f32) -> Vec<[f64; 2]> {
-        let width = self.mean.len();
-        let (mut plain, mut by_x) = (vec![0.0; width], vec![0.0; width]);
-        let maps = self.x.chunks(width).zip(self.y.chunks(width)).zip(self.dy.chunks(width));
-        for ((x, y), dy) in maps {
-            let sums = plain.iter_mut().zip(&mut by_x).zip(self.mean);
-            for (((x, y), dy), ((plain, by_x), mean)) in x.iter().zip(y).zip(dy).zip(sums) {
-                let g = gate(*dy, *y);
-                *plain += g;
-                *by_x += g * (x - mean);
-            }
-        }
-        let sums = by_channel(&plain, self.channels);
-        sums.into_iter().zip(by_channel(&by_x, self.channels)).map(|(a, b)| [a, b]).collect()
-    }
-}
-
-impl Leaf for GradientSums<'_> {
-    type Out = Vec<[f64; 2]>;
-
-    #[inline(always)]
-    unsafe fn run<S: Simd>(self) -> Vec<[f64; 2]> {
-        if self.gated { self.rows(gate) } else { self.rows(|dy, _| dy) }
-    }
-}
-
-/// `dx = scale g + slope (x - mean) + shift`.
-struct InputGradient<'a> {
-    x: &'a [f32],
-    y: &'a [f32],
-    dy: &'a [f32],
-    gated: bool,
-    mean: &'a [f32],
-    scale: &'a [f32],
-    slope: &'a [f32],
-    shift: &'a [f32],
-    dx: &'a mut [f32],
-}
-
-impl InputGradient<'_> {
-    #[inline(always)]
-    fn rows(self, gate: impl Fn(f32, f32) -> f32) {
-        let width = self.mean.len();
-        let maps = self.x.chunks(width).zip(self.y.chunks(width)).zip(self.dy.chunks(width));
-        for (((x, y), dy), dx) in maps.zip(self.dx.chunks_mut(width)) {
-            let parameters = self.mean.iter().zip(self.scale).zip(self.slope).zip(self.shift);
-            let maps = x.iter().zip(y).zip(dy).zip(dx);
-            for ((((x, y), dy), dx), (((mean, scale), slope), shift)) in maps.zip(parameters) {
-                *dx = scale * gate(*dy, *y) + (slope * (x - mean) + shift);
-            }
-        }
-    }
-}
-
-impl Leaf for InputGradient<'_> {
-    type Out = ();
-
-    #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
-        if self.gated { self.rows(gate) } else { self.rows(|dy, _| dy) }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tasks::tests::{assert_close, bits, pattern, same_on_any_number_of_threads};
+    use crate::testing::{assert_within, bits, pattern, same_on_any_number_of_threads};
 
     const EPSILON: f32 = 1e-3;
 
     /// Pixels and channels: one value, vectors left unfilled, several blocks, a block with a part of a row.
     fn sizes() -> Vec<(usize, usize)> {
-        let all = [(1, 1), (1, 17), (35, 3), (35, 64), (6, 512), (4100, 12), (5000, 1), (1500, 65), (700, 48), (40, 1000)];
+        let all = [
+            (1, 1),
+            (1, 17),
+            (35, 3),
+            (35, 64),
+            (6, 512),
+            (4100, 12),
+            (5000, 1),
+            (1500, 65),
+            (700, 48),
+            (40, 1000),
+        ];
         let few = if cfg!(miri) { 3 } else { all.len() };
         all[..few].to_vec()
     }
@@ -426,14 +342,39 @@ mod tests {
         let row = || vec![f32::NAN; channels];
         let (mut y, mut mean, mut variance) = (map(), row(), row());
         forward_train(
-            isa, &case.x, &case.gamma, &case.beta, EPSILON, relu, &mut y, &mut mean, &mut variance,
+            isa,
+            &case.x,
+            &case.gamma,
+            &case.beta,
+            EPSILON,
+            relu,
+            &mut y,
+            &mut mean,
+            &mut variance,
         );
         let (mut dx, mut dgamma, mut dbeta) = (map(), row(), row());
         let gate = relu.then_some(&y[..]);
         backward(
-            isa, &case.x, &case.gamma, &mean, &variance, EPSILON, gate, &case.dy, &mut dx, &mut dgamma, &mut dbeta,
+            isa,
+            &case.x,
+            &case.gamma,
+            &mean,
+            &variance,
+            EPSILON,
+            gate,
+            &case.dy,
+            &mut dx,
+            &mut dgamma,
+            &mut dbeta,
         );
-        Found { y, mean, variance, dx, dgamma, dbeta }
+        Found {
+            y,
+            mean,
+            variance,
+            dx,
+            dgamma,
+            dbeta,
+        }
     }
 
     /// Compares with plain loops in float64. Gates are those of the float32 output, which a value near 0 may flip.
@@ -447,7 +388,13 @@ mod tests {
         for c in 0..channels {
             let column = || (c..len).step_by(channels);
             let x = |i: usize| f64::from(case.x[i]);
-            let g = |i: usize| if relu && found.y[i] <= 0.0 { 0.0 } else { f64::from(case.dy[i]) };
+            let g = |i: usize| {
+                if relu && found.y[i] <= 0.0 {
+                    0.0
+                } else {
+                    f64::from(case.dy[i])
+                }
+            };
             means[c] = column().map(x).sum::<f64>() / n;
             variances[c] = column().map(|i| (x(i) - means[c]).powi(2)).sum::<f64>() / n;
             let s = 1.0 / (variances[c] + f64::from(EPSILON)).sqrt();
@@ -462,13 +409,18 @@ mod tests {
             }
         }
         // Means to a rounding of values up to 5; s is up to 32, where one pixel has no spread.
-        assert_close(&found.mean, &means, 2e-7, &format!("mean, {what}"));
-        assert_close(&found.variance, &variances, 2e-7, &format!("variance, {what}"));
-        assert_close(&found.y, &y, 5e-6, &format!("y, {what}"));
+        assert_within(&format!("mean, {what}"), &found.mean, &means, 2e-7);
+        assert_within(
+            &format!("variance, {what}"),
+            &found.variance,
+            &variances,
+            2e-7,
+        );
+        assert_within(&format!("y, {what}"), &found.y, &y, 5e-6);
         // Sums of up to 5000 terms of order 1, of which float32 adds some tens to a few hundred.
-        assert_close(&found.dbeta, &dbeta, 1e-5, &format!("dbeta, {what}"));
-        assert_close(&found.dgamma, &dgamma, 1e-5, &format!("dgamma, {what}"));
-        assert_close(&found.dx, &dx, 1e-5, &format!("dx, {what}"));
+        assert_within(&format!("dbeta, {what}"), &found.dbeta, &dbeta, 1e-5);
+        assert_within(&format!("dgamma, {what}"), &found.dgamma, &dgamma, 1e-5);
+        assert_within(&format!("dx, {what}"), &found.dx, &dx, 1e-5);
     }
 
     #[test]
@@ -477,7 +429,12 @@ mod tests {
             let case = case(pixels, channels);
             for isa in Isa::available() {
                 for relu in [false, true] {
-                    check_case(isa, &case, relu, &format!("{isa}, {pixels} px of {channels}, relu {relu}"));
+                    check_case(
+                        isa,
+                        &case,
+                        relu,
+                        &format!("{isa}, {pixels} px of {channels}, relu {relu}"),
+                    );
                 }
             }
         }
@@ -499,7 +456,10 @@ mod tests {
                 let center = column().sum::<f64>() / pixels as f64;
                 let spread = column().map(|x| (x - center).powi(2)).sum::<f64>() / pixels as f64;
                 assert!((f64::from(mean[c]) - center).abs() < 1e-7 * center, "{isa}");
-                assert!((f64::from(variance[c]) - spread).abs() < 1e-5 * spread, "{isa}: {variance:?}, not {spread}");
+                assert!(
+                    (f64::from(variance[c]) - spread).abs() < 1e-5 * spread,
+                    "{isa}: {variance:?}, not {spread}"
+                );
             }
         }
     }
@@ -509,7 +469,17 @@ mod tests {
         for isa in Isa::available() {
             let (mut y, mut mean, mut variance) = ([0.0; 99], [0.0; 3], [0.0; 3]);
             let beta = [0.5, 0.25, -0.5];
-            forward_train(isa, &[0.3; 99], &[2.0; 3], &beta, EPSILON, false, &mut y, &mut mean, &mut variance);
+            forward_train(
+                isa,
+                &[0.3; 99],
+                &[2.0; 3],
+                &beta,
+                EPSILON,
+                false,
+                &mut y,
+                &mut mean,
+                &mut variance,
+            );
             assert_eq!((mean, variance), ([0.3; 3], [0.0; 3]));
             assert!(y.iter().enumerate().all(|(i, y)| *y == beta[i % 3]));
         }
@@ -517,8 +487,9 @@ mod tests {
 
     /// No fused operations: the same everywhere.
     #[test]
+    #[cfg_attr(miri, ignore = "minutes long")]
     fn bits_depend_neither_on_the_path_nor_on_the_threads() {
-        let case = if cfg!(miri) { case(90, 3) } else { case(3000, 17) };
+        let case = case(3000, 17);
         let work = |isa| {
             let f = found(isa, &case, true);
             [f.y, f.mean, f.variance, f.dx, f.dgamma, f.dbeta].map(|values| bits(&values))
@@ -535,11 +506,23 @@ mod tests {
             let mut case = case(40, 3);
             case.x[10] = f32::NAN;
             let found = found(isa, &case, true);
-            assert!(found.y.iter().enumerate().all(|(i, y)| y.is_nan() == (i % 3 == 1)), "{isa}");
+            assert!(
+                found
+                    .y
+                    .iter()
+                    .enumerate()
+                    .all(|(i, y)| y.is_nan() == (i % 3 == 1)),
+                "{isa}"
+            );
             let mut y = [0.0; 3];
             let x = [f32::INFINITY, f32::NAN, -1.0];
-            forward_eval(isa, &x, &[1.0; 3], &[0.0; 3], &[0.0; 3], &[1.0; 3], 0.0, true, &mut y);
-            assert!(y[0] == f32::INFINITY && y[1].is_nan() && y[2] == 0.0, "{isa}: {y:?}");
+            forward_eval(
+                isa, &x, &[1.0; 3], &[0.0; 3], &[0.0; 3], &[1.0; 3], 0.0, true, &mut y,
+            );
+            assert!(
+                y[0] == f32::INFINITY && y[1].is_nan() && y[2] == 0.0,
+                "{isa}: {y:?}"
+            );
         }
     }
 
@@ -547,7 +530,15 @@ mod tests {
     #[should_panic(expected = "10 values are no map of 3 channels")]
     fn lengths_are_checked() {
         forward_eval(
-            Isa::Portable, &[0.0; 10], &[0.0; 3], &[0.0; 3], &[0.0; 3], &[0.0; 3], 0.0, true, &mut [0.0; 10],
+            Isa::Portable,
+            &[0.0; 10],
+            &[0.0; 3],
+            &[0.0; 3],
+            &[0.0; 3],
+            &[0.0; 3],
+            0.0,
+            true,
+            &mut [0.0; 10],
         );
     }
 }

@@ -1,5 +1,10 @@
 //! The pixels of a batch of maps, and the way between channels first and channels last.
 
+use crate::Isa;
+use crate::scratch::Shared;
+use crate::simd::{self, Leaf, Simd};
+use crate::tasks;
+
 /// How many images of which size. A map on it has `pixels() * channels` values, channels last.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Grid {
@@ -19,12 +24,20 @@ impl Grid {
 
     /// The grid after a 2x2 pooling (odd rows and columns at the end are dropped).
     pub fn halved(self) -> Self {
-        Grid { height: self.height / 2, width: self.width / 2, ..self }
+        Grid {
+            height: self.height / 2,
+            width: self.width / 2,
+            ..self
+        }
     }
 
     /// The grid after a deconvolution with stride 2.
     pub fn doubled(self) -> Self {
-        Grid { height: self.height * 2, width: self.width * 2, ..self }
+        Grid {
+            height: self.height * 2,
+            width: self.width * 2,
+            ..self
+        }
     }
 
     /// Channels of a map of `len` values.
@@ -34,7 +47,7 @@ impl Grid {
     pub fn channels(self, len: usize) -> usize {
         let pixels = self.pixels();
         assert!(
-            pixels > 0 && len % pixels == 0,
+            pixels > 0 && len.is_multiple_of(pixels),
             "{len} values are no map on {self:?}"
         );
         len / pixels
@@ -48,13 +61,17 @@ impl Grid {
 pub fn nhwc_from_nchw(grid: Grid, x: &[f32], y: &mut [f32]) {
     assert_eq!(x.len(), y.len(), "maps of one size");
     let (channels, plane) = (grid.channels(x.len()), grid.height * grid.width);
-    for (x, y) in x.chunks(plane * channels).zip(y.chunks_mut(plane * channels)) {
-        for (c, x) in x.chunks(plane).enumerate() {
-            for (x, y) in x.iter().zip(y[c..].iter_mut().step_by(channels)) {
-                *y = *x;
-            }
+    each_pixels(grid, channels, x, y, |x, y, first, pixels| {
+        let (x, y) = (x.wrapping_add(first), y.wrapping_add(first * channels));
+        Transpose {
+            x,
+            row: plane,
+            y,
+            column: channels,
+            rows: channels,
+            columns: pixels,
         }
-    }
+    });
 }
 
 /// Channels first from channels last.
@@ -64,10 +81,218 @@ pub fn nhwc_from_nchw(grid: Grid, x: &[f32], y: &mut [f32]) {
 pub fn nchw_from_nhwc(grid: Grid, x: &[f32], y: &mut [f32]) {
     assert_eq!(x.len(), y.len(), "maps of one size");
     let (channels, plane) = (grid.channels(x.len()), grid.height * grid.width);
-    for (x, y) in x.chunks(plane * channels).zip(y.chunks_mut(plane * channels)) {
-        for (c, y) in y.chunks_mut(plane).enumerate() {
-            for (x, y) in x[c..].iter().step_by(channels).zip(y) {
-                *y = *x;
+    each_pixels(grid, channels, x, y, |x, y, first, pixels| {
+        let (x, y) = (x.wrapping_add(first * channels), y.wrapping_add(first));
+        Transpose {
+            x,
+            row: channels,
+            y,
+            column: plane,
+            rows: pixels,
+            columns: channels,
+        }
+    });
+}
+
+/// Transposes the pieces of each image; `piece` tells how, from pointers to the image in `x` and `y`, a first pixel and a
+/// number of pixels.
+fn each_pixels(
+    grid: Grid,
+    channels: usize,
+    x: &[f32],
+    y: &mut [f32],
+    piece: impl Fn(*const f32, *mut f32, usize, usize) -> Transpose + Send + Sync,
+) {
+    let plane = grid.height * grid.width;
+    let step = tasks::rows_per_task(channels).next_multiple_of(64);
+    let starts = (0..plane).step_by(step);
+    let pieces = (0..grid.batch).flat_map(|image| starts.clone().map(move |first| (image, first)));
+    let to = Shared::new(y);
+    tasks::each(pieces, |(image, first)| {
+        let at = image * plane * channels;
+        let (x, y) = (x[at..].as_ptr(), to.offset(at).pointer());
+        let leaf = piece(x, y, first, step.min(plane - first));
+        // SAFETY: the piece's pixels of all channels lie inside `x` and `y`, and no other piece has them.
+        unsafe { simd::run(tasks::streaming(Isa::current()), leaf) }
+    });
+}
+
+/// `y[j * column + i] = x[i * row + j]` for i below `rows` and j below `columns`.
+struct Transpose {
+    x: *const f32,
+    row: usize,
+    y: *mut f32,
+    column: usize,
+    rows: usize,
+    columns: usize,
+}
+
+/// Fewest rows and columns of a tile that is not moved value by value.
+const NARROW: usize = 4;
+
+impl Leaf for Transpose {
+    type Out = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        // Tiles of a vector's length both ways. The rows of the smaller side change fastest: whole lines are written.
+        let (high, wide) = (
+            self.rows.div_ceil(S::LANES),
+            self.columns.div_ceil(S::LANES),
+        );
+        for t in 0..high * wide {
+            let (i, j) = if high > wide {
+                (t % high, t / high)
+            } else {
+                (t / wide, t % wide)
+            };
+            let (i, j) = (i * S::LANES, j * S::LANES);
+            let rows = S::LANES.min(self.rows - i);
+            let columns = S::LANES.min(self.columns - j);
+            // SAFETY: the tile lies inside.
+            unsafe {
+                let (x, y) = (
+                    self.x.add(i * self.row + j),
+                    self.y.add(j * self.column + i),
+                );
+                if rows == S::LANES && columns == S::LANES {
+                    self.whole_tile::<S>(x, y);
+                } else if rows >= NARROW && columns >= NARROW {
+                    self.part_of_tile::<S>(x, y, rows, columns);
+                } else {
+                    for (i, j) in (0..rows).flat_map(|i| (0..columns).map(move |j| (i, j))) {
+                        *y.add(j * self.column + i) = *x.add(i * self.row + j);
+                    }
+                }
+            }
+        }
+    }
+}
+
+impl Transpose {
+    /// # Safety
+    /// LANES rows and columns from `x` and to `y`.
+    #[inline(always)]
+    unsafe fn whole_tile<S: Simd>(&self, x: *const f32, y: *mut f32) {
+        // SAFETY: the caller's.
+        unsafe {
+            let mut tile = [S::zero(); MOST_LANES];
+            for (i, v) in tile[..S::LANES].iter_mut().enumerate() {
+                *v = S::load(x.add(i * self.row));
+            }
+            let tile = transposed::<S>(tile);
+            for (j, v) in tile[..S::LANES].iter().enumerate() {
+                S::store(y.add(j * self.column), *v);
+            }
+        }
+    }
+
+    /// # Safety
+    /// As many rows and columns, at most LANES.
+    #[inline(always)]
+    unsafe fn part_of_tile<S: Simd>(
+        &self,
+        x: *const f32,
+        y: *mut f32,
+        rows: usize,
+        columns: usize,
+    ) {
+        // SAFETY: the caller's.
+        unsafe {
+            let mut tile = [S::zero(); MOST_LANES];
+            for (i, v) in tile[..rows].iter_mut().enumerate() {
+                *v = S::load_part(x.add(i * self.row), columns);
+            }
+            let tile = transposed::<S>(tile);
+            for (j, v) in tile[..columns].iter().enumerate() {
+                S::store_part(y.add(j * self.column), rows, *v);
+            }
+        }
+    }
+}
+
+/// Lanes of the longest vectors.
+const MOST_LANES: usize = 16;
+
+/// The first LANES vectors, transposed: each round interleaves the first half of the rows with the second.
+///
+/// # Safety
+/// The path's instructions.
+#[inline(always)]
+unsafe fn transposed<S: Simd>(mut tile: [S::V; MOST_LANES]) -> [S::V; MOST_LANES] {
+    for _ in 0..S::LANES.ilog2() {
+        let from = tile;
+        for i in 0..S::LANES / 2 {
+            // SAFETY: the caller's.
+            [tile[2 * i], tile[2 * i + 1]] =
+                unsafe { S::interleave(from[i], from[i + S::LANES / 2]) };
+        }
+    }
+    tile
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{grids, pattern};
+
+    /// On every path: the leaf that both directions share.
+    #[test]
+    fn a_transposed_matrix_has_its_rows_for_columns() {
+        for (rows, columns) in [
+            (1, 1),
+            (3, 40),
+            (16, 16),
+            (8, 33),
+            (17, 6),
+            (64, 20),
+            (5, 5),
+            (12, 100),
+        ] {
+            let x = pattern(rows * columns, 1);
+            for isa in Isa::available() {
+                let mut found = vec![f32::NAN; x.len()];
+                let (x, y) = (x.as_ptr(), found.as_mut_ptr());
+                let leaf = Transpose {
+                    x,
+                    row: columns,
+                    y,
+                    column: rows,
+                    rows,
+                    columns,
+                };
+                // SAFETY: both have rows * columns values.
+                unsafe { simd::run(isa, leaf) }
+                for (at, y) in found.iter().enumerate() {
+                    // SAFETY: as above.
+                    let expected = unsafe { *x.add(at % rows * columns + at / rows) };
+                    assert!(*y == expected, "{isa}: {rows} x {columns} at {at}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn channels_go_last_and_come_back() {
+        let large = Grid {
+            batch: 2,
+            height: 60,
+            width: 61,
+        };
+        let grids = grids().into_iter().chain((!cfg!(miri)).then_some(large));
+        for grid in grids {
+            for channels in [1, 3, 12, 17, 64] {
+                let x = pattern(grid.pixels() * channels, 2);
+                let (mut last, mut first) = (vec![f32::NAN; x.len()], vec![f32::NAN; x.len()]);
+                nhwc_from_nchw(grid, &x, &mut last);
+                let plane = grid.height * grid.width;
+                for (i, value) in last.iter().enumerate() {
+                    let (pixel, c) = (i / channels, i % channels);
+                    let at = (pixel / plane * channels + c) * plane + pixel % plane;
+                    assert!(*value == x[at], "{grid:?} of {channels}");
+                }
+                nchw_from_nhwc(grid, &last, &mut first);
+                assert!(first == x, "{grid:?} of {channels}");
             }
         }
     }

@@ -20,12 +20,26 @@ pub fn forward(isa: Isa, grid: Grid, x: &[f32], y: &mut [f32]) {
         return;
     }
     let (row, half_row) = (grid.width * channels, half.width * channels);
-    let images = x.chunks(grid.height * row).zip(y.chunks_mut(half.height * half_row));
+    let images = x
+        .chunks(grid.height * row)
+        .zip(y.chunks_mut(half.height * half_row));
     let rows = tasks::rows_per_task(2 * row);
-    let pieces = images.flat_map(|(x, y)| x.chunks(rows * 2 * row).zip(y.chunks_mut(rows * half_row)));
+    let pieces =
+        images.flat_map(|(x, y)| x.chunks(rows * 2 * row).zip(y.chunks_mut(rows * half_row)));
     tasks::each(pieces, |(x, y)| {
         // SAFETY: the leaf has slices and checks what it reads of them.
-        unsafe { simd::run(isa, Forward { channels, row, half_row, x, y }) }
+        unsafe {
+            simd::run(
+                isa,
+                Forward {
+                    channels,
+                    row,
+                    half_row,
+                    x,
+                    y,
+                },
+            )
+        }
     });
 }
 
@@ -46,16 +60,33 @@ pub fn backward(isa: Isa, grid: Grid, x: &[f32], dy: &[f32], dx: &mut [f32]) {
     }
     let (row, half_row) = (grid.width * channels, half.width * channels);
     let image = grid.height * row;
-    let images = x.chunks(image).zip(dy.chunks(half.height * half_row)).zip(dx.chunks_mut(image));
+    let images = x
+        .chunks(image)
+        .zip(dy.chunks(half.height * half_row))
+        .zip(dx.chunks_mut(image));
     let rows = tasks::rows_per_task(2 * row);
     let pieces = images.flat_map(|((x, dy), dx)| {
         // An odd last row may be a piece of its own, without windows.
         let dy = dy.chunks(rows * half_row).chain(std::iter::repeat(&[][..]));
-        x.chunks(rows * 2 * row).zip(dy).zip(dx.chunks_mut(rows * 2 * row))
+        x.chunks(rows * 2 * row)
+            .zip(dy)
+            .zip(dx.chunks_mut(rows * 2 * row))
     });
     tasks::each(pieces, |((x, dy), dx)| {
         // SAFETY: the leaf has slices and checks what it reads of them.
-        unsafe { simd::run(isa, Backward { channels, row, half_row, x, dy, dx }) }
+        unsafe {
+            simd::run(
+                isa,
+                Backward {
+                    channels,
+                    row,
+                    half_row,
+                    x,
+                    dy,
+                    dx,
+                },
+            )
+        }
     });
 }
 
@@ -64,7 +95,10 @@ pub fn backward(isa: Isa, grid: Grid, x: &[f32], dy: &[f32], dx: &mut [f32]) {
 fn check(grid: Grid, len: usize, half_len: usize) -> usize {
     let channels = grid.channels(len);
     let expected = grid.halved().pixels() * channels;
-    assert_eq!(half_len, expected, "values of a map of {channels} channels on {grid:?}, halved");
+    assert_eq!(
+        half_len, expected,
+        "values of a map of {channels} channels on {grid:?}, halved"
+    );
     channels
 }
 
@@ -82,11 +116,18 @@ impl Leaf for Forward<'_> {
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        for (x, y) in self.x.chunks_exact(2 * self.row).zip(self.y.chunks_mut(self.half_row)) {
+        for (x, y) in self
+            .x
+            .chunks_exact(2 * self.row)
+            .zip(self.y.chunks_mut(self.half_row))
+        {
             let (top, bottom) = x.split_at(self.row);
-            let pairs = top.chunks_exact(2 * self.channels).zip(bottom.chunks_exact(2 * self.channels));
+            let pairs = top
+                .chunks_exact(2 * self.channels)
+                .zip(bottom.chunks_exact(2 * self.channels));
             for ((top, bottom), y) in pairs.zip(y.chunks_exact_mut(self.channels)) {
-                let ((a, b), (c, d)) = (top.split_at(self.channels), bottom.split_at(self.channels));
+                let ((a, b), (c, d)) =
+                    (top.split_at(self.channels), bottom.split_at(self.channels));
                 let [a, b, c, d] = [a, b, c, d].map(<[f32]>::as_ptr);
                 let y = y.as_mut_ptr();
                 // SAFETY: a, b, c, d and y have `channels` values each, and `at + n` is at most that.
@@ -142,13 +183,18 @@ impl Leaf for Backward<'_> {
         for ((x, dx), dy) in rows.zip(self.dy.chunks(self.half_row)) {
             let (top, bottom) = x.split_at(self.row);
             let (dtop, dbottom) = dx.split_at_mut(self.row);
-            let pairs = top.chunks_exact(2 * channels).zip(bottom.chunks_exact(2 * channels));
+            let pairs = top
+                .chunks_exact(2 * channels)
+                .zip(bottom.chunks_exact(2 * channels));
             let mut dtops = dtop.chunks_exact_mut(2 * channels);
             let mut dbottoms = dbottom.chunks_exact_mut(2 * channels);
             let dpairs = dtops.by_ref().zip(dbottoms.by_ref());
-            for (((top, bottom), (dtop, dbottom)), dy) in pairs.zip(dpairs).zip(dy.chunks_exact(channels)) {
+            for (((top, bottom), (dtop, dbottom)), dy) in
+                pairs.zip(dpairs).zip(dy.chunks_exact(channels))
+            {
                 let ((a, b), (c, d)) = (top.split_at(channels), bottom.split_at(channels));
-                let ((da, db), (dc, dd)) = (dtop.split_at_mut(channels), dbottom.split_at_mut(channels));
+                let ((da, db), (dc, dd)) =
+                    (dtop.split_at_mut(channels), dbottom.split_at_mut(channels));
                 let from = [a, b, c, d, dy].map(<[f32]>::as_ptr);
                 let to = [da, db, dc, dd].map(<[f32]>::as_mut_ptr);
                 // SAFETY: all nine have `channels` values, and `at + n` is at most that.
@@ -200,7 +246,7 @@ unsafe fn spread<S: Simd>(a: S::V, b: S::V, c: S::V, d: S::V, dy: S::V) -> [S::V
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tasks::tests::{bits, pattern, same_on_any_number_of_threads};
+    use crate::testing::{bits, pattern, same_on_any_number_of_threads};
 
     fn cases() -> Vec<(Grid, usize)> {
         let all = [
@@ -216,12 +262,27 @@ mod tests {
             (1, 3, 700, 16),
         ];
         let few = if cfg!(miri) { 6 } else { all.len() };
-        all[..few].iter().map(|&(batch, height, width, c)| (Grid { batch, height, width }, c)).collect()
+        all[..few]
+            .iter()
+            .map(|&(batch, height, width, c)| {
+                (
+                    Grid {
+                        batch,
+                        height,
+                        width,
+                    },
+                    c,
+                )
+            })
+            .collect()
     }
 
     /// Few different values, so that windows have several maxima.
     fn map(grid: Grid, channels: usize) -> Vec<f32> {
-        pattern(grid.pixels() * channels, 1).iter().map(|v| (v * 2.0).round()).collect()
+        pattern(grid.pixels() * channels, 1)
+            .iter()
+            .map(|v| (v * 2.0).round())
+            .collect()
     }
 
     /// Values and places of the first maxima.
@@ -229,10 +290,18 @@ mod tests {
         let half = grid.halved();
         let mut found = Vec::new();
         for b in 0..grid.batch {
-            for (py, px) in (0..half.height).flat_map(|py| (0..half.width).map(move |px| (py, px))) {
+            for (py, px) in (0..half.height).flat_map(|py| (0..half.width).map(move |px| (py, px)))
+            {
                 for c in 0..channels {
-                    let at = |t: usize| ((b * grid.height + 2 * py + t / 2) * grid.width + 2 * px + t % 2) * channels + c;
-                    let first = (1..4).fold(at(0), |best, t| if x[at(t)] > x[best] { at(t) } else { best });
+                    let at = |t: usize| {
+                        ((b * grid.height + 2 * py + t / 2) * grid.width + 2 * px + t % 2)
+                            * channels
+                            + c
+                    };
+                    let first = (1..4).fold(
+                        at(0),
+                        |best, t| if x[at(t)] > x[best] { at(t) } else { best },
+                    );
                     found.push((x[first], first));
                 }
             }
@@ -247,11 +316,17 @@ mod tests {
             let expected = plain(grid, channels, &x);
             let dy = pattern(expected.len(), 2);
             let mut expected_dx = vec![0.0; x.len()];
-            expected.iter().zip(&dy).for_each(|((_, at), dy)| expected_dx[*at] = *dy);
+            expected
+                .iter()
+                .zip(&dy)
+                .for_each(|((_, at), dy)| expected_dx[*at] = *dy);
             for isa in Isa::available() {
                 let mut y = vec![f32::NAN; expected.len()];
                 forward(isa, grid, &x, &mut y);
-                assert!(y.iter().zip(&expected).all(|(y, (e, _))| y == e), "{isa} {grid:?} of {channels}");
+                assert!(
+                    y.iter().zip(&expected).all(|(y, (e, _))| y == e),
+                    "{isa} {grid:?} of {channels}"
+                );
                 let mut dx = vec![f32::NAN; x.len()];
                 backward(isa, grid, &x, &dy, &mut dx);
                 assert!(dx == expected_dx, "{isa} {grid:?} of {channels}");
@@ -261,7 +336,11 @@ mod tests {
 
     #[test]
     fn what_is_no_number_is_the_maximum_wherever_it_stands() {
-        let grid = Grid { batch: 1, height: 2, width: 2 };
+        let grid = Grid {
+            batch: 1,
+            height: 2,
+            width: 2,
+        };
         for isa in Isa::available() {
             for at in 0..4 {
                 let mut x = [1.0, f32::INFINITY, 2.0, 3.0];
@@ -277,8 +356,13 @@ mod tests {
     }
 
     #[test]
+    #[cfg_attr(miri, ignore = "minutes long")]
     fn bits_do_not_depend_on_the_threads() {
-        let grid = Grid { batch: 2, height: 61, width: if cfg!(miri) { 40 } else { 200 } };
+        let grid = Grid {
+            batch: 2,
+            height: 61,
+            width: 200,
+        };
         let x = map(grid, 5);
         let len = grid.halved().pixels() * 5;
         for isa in Isa::available() {
@@ -294,6 +378,15 @@ mod tests {
     #[test]
     #[should_panic(expected = "halved")]
     fn lengths_are_checked() {
-        forward(Isa::Portable, Grid { batch: 1, height: 4, width: 4 }, &[0.0; 32], &mut [0.0; 9]);
+        forward(
+            Isa::Portable,
+            Grid {
+                batch: 1,
+                height: 4,
+                width: 4,
+            },
+            &[0.0; 32],
+            &mut [0.0; 9],
+        );
     }
 }

@@ -47,6 +47,8 @@ pub(crate) unsafe trait Simd: Copy + Send + Sync + 'static {
     unsafe fn relu(v: Self::V) -> Self::V;
     /// `a` where it is NaN, `b` elsewhere.
     unsafe fn nan_or(a: Self::V, b: Self::V) -> Self::V;
+    /// `a0 b0 a1 b1 ...`, in two vectors.
+    unsafe fn interleave(a: Self::V, b: Self::V) -> [Self::V; 2];
 
     #[inline(always)]
     unsafe fn zero() -> Self::V {
@@ -72,8 +74,8 @@ pub(crate) trait Leaf {
 /// What the leaf needs. An [`Isa`] that the machine does not have cannot be obtained but by naming it; that is checked.
 #[inline]
 pub(crate) unsafe fn run<L: Leaf>(isa: Isa, leaf: L) -> L::Out {
-    // SAFETY: `available` was checked where the Isa was made current or parsed; a bare variant is checked in debug.
     debug_assert!(Isa::available().contains(&isa), "{isa} is not on this machine");
+    // SAFETY: `available` was checked where the Isa was made current or parsed; a bare variant is checked in debug.
     unsafe {
         match isa {
             #[cfg(target_arch = "x86_64")]
@@ -159,6 +161,11 @@ mod x86 {
             fn nan_or(a: __m512, b: __m512) -> __m512 {
                 _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_UNORD_Q>(a, a), b, a)
             }
+            fn interleave(a: __m512, b: __m512) -> [__m512; 2] {
+                let low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+                let high = _mm512_add_epi32(low, _mm512_set1_epi32(8));
+                [_mm512_permutex2var_ps(a, low, b), _mm512_permutex2var_ps(a, high, b)]
+            }
         }
     }
 
@@ -199,6 +206,10 @@ mod x86 {
             fn relu(v: __m256) -> __m256 { _mm256_max_ps(_mm256_setzero_ps(), v) }
             fn nan_or(a: __m256, b: __m256) -> __m256 {
                 _mm256_blendv_ps(b, a, _mm256_cmp_ps::<_CMP_UNORD_Q>(a, a))
+            }
+            fn interleave(a: __m256, b: __m256) -> [__m256; 2] {
+                let (low, high) = (_mm256_unpacklo_ps(a, b), _mm256_unpackhi_ps(a, b));
+                [_mm256_permute2f128_ps::<0x20>(low, high), _mm256_permute2f128_ps::<0x31>(low, high)]
             }
         }
     }
@@ -255,6 +266,7 @@ mod neon {
             // The instruction returns NaN where an operand is.
             fn relu(v: float32x4_t) -> float32x4_t { vmaxq_f32(v, vdupq_n_f32(0.0)) }
             fn nan_or(a: float32x4_t, b: float32x4_t) -> float32x4_t { vbslq_f32(vceqq_f32(a, a), b, a) }
+            fn interleave(a: float32x4_t, b: float32x4_t) -> [float32x4_t; 2] { [vzip1q_f32(a, b), vzip2q_f32(a, b)] }
         }
     }
 }
@@ -305,6 +317,9 @@ mod portable {
             }
             fn relu(v: [f32; 4]) -> [f32; 4] { v.map(|v| if 0.0 > v { 0.0 } else { v }) }
             fn nan_or(a: [f32; 4], b: [f32; 4]) -> [f32; 4] { zip(a, b, |a, b| if a.is_nan() { a } else { b }) }
+            fn interleave(a: [f32; 4], b: [f32; 4]) -> [[f32; 4]; 2] {
+                [[a[0], b[0], a[1], b[1]], [a[2], b[2], a[3], b[3]]]
+            }
         }
     }
 }
