@@ -150,24 +150,34 @@ mod line {
     }
 }
 
+/// The body once for each `$i` below `$n` (at most 6), with `$i` known to the compiler: an array that is indexed in a
+/// loop that stays a loop lives in memory and not in registers.
+macro_rules! each {
+    ($i:ident < $n:expr, $body:block) => {{
+        each!(@ $i, $n, $body, 0 1 2 3 4 5);
+    }};
+    (@ $i:ident, $n:expr, $body:block, $($value:literal)*) => {
+        $(
+            if $value < $n {
+                let $i: usize = $value;
+                $body
+            }
+        )*
+    };
+}
+
 /// A transform in both dimensions: over all columns, then over all rows.
 macro_rules! both {
     ($f:path, $s:ty, $n:expr, $d:expr) => {{
-        let mut columns = $d;
-        for c in 0..$n {
-            let mut column: [<$s>::V; $n] = [$d[0][c]; $n];
-            for r in 0..$n {
-                column[r] = $d[r][c];
-            }
+        let mut values = $d;
+        each!(c < $n, {
+            let mut column: [<$s>::V; $n] = [values[0][c]; $n];
+            each!(r < $n, { column[r] = values[r][c]; });
             let column = $f(column);
-            for r in 0..$n {
-                columns[r][c] = column[r];
-            }
-        }
-        for r in 0..$n {
-            columns[r] = $f(columns[r]);
-        }
-        columns
+            each!(r < $n, { values[r][c] = column[r]; });
+        });
+        each!(r < $n, { values[r] = $f(values[r]); });
+        values
     }};
 }
 
@@ -329,59 +339,60 @@ struct Source<'a> {
 }
 
 impl Source<'_> {
-    /// A vector of `n` channels from value `at`.
+    /// The `size x size` pixels of a tile from `(row, column)` of the image at `image`, zeros where there is none.
+    ///
+    /// # Safety
+    /// The machine has the path of `S`.
     #[inline(always)]
-    unsafe fn load<S: Simd>(&self, at: usize, n: usize) -> S::V {
-        // SAFETY: `n` values from `at` are in the map; the caller has the path of `S`.
-        unsafe {
-            let whole = n == S::LANES;
-            let pointer = self.map.as_ptr().add(at);
-            let value = if whole { S::load(pointer) } else { S::load_part(pointer, n) };
-            match self.gate {
-                None => value,
-                Some(gate) => {
-                    let pointer = gate.as_ptr().add(at);
-                    S::gate(value, if whole { S::load(pointer) } else { S::load_part(pointer, n) })
-                }
-            }
-        }
-    }
-
-    /// Takes the `size x size` pixels from `(row, column)` of the image at `image`, zeros where there is none.
-    #[inline(always)]
-    unsafe fn tile<S: Simd, const IN: usize>(
+    unsafe fn tile<S: Simd, const IN: usize, const SIZE: usize>(
         &self,
         grid: Grid,
         image: usize,
         row: isize,
         column: isize,
-        size: usize,
         channel: usize,
     ) -> [[S::V; IN]; IN] {
         let n = S::LANES.min(self.channels - channel);
+        let inside = row >= 0
+            && column >= 0
+            && row as usize + SIZE <= grid.height
+            && column as usize + SIZE <= grid.width;
         // SAFETY: only pixels of the image are loaded, `n` channels of which are there.
         unsafe {
             let mut d = [[S::zero(); IN]; IN];
-            let inside = row >= 0
-                && column >= 0
-                && row as usize + size <= grid.height
-                && column as usize + size <= grid.width;
-            if inside {
-                let first = image + row as usize * grid.width + column as usize;
-                for r in 0..size {
-                    for c in 0..size {
-                        let pixel = first + r * grid.width + c;
-                        d[r][c] = self.load::<S>(pixel * self.channels + channel, n);
+            if inside && n == S::LANES {
+                let first = (image + row as usize * grid.width + column as usize) * self.channels + channel;
+                let line = grid.width * self.channels;
+                let map = self.map.as_ptr().add(first);
+                match self.gate {
+                    None => each!(r < SIZE, {
+                        let map = map.add(r * line);
+                        each!(c < SIZE, { d[r][c] = S::load(map.add(c * self.channels)); });
+                    }),
+                    Some(gate) => {
+                        let gate = gate.as_ptr().add(first);
+                        each!(r < SIZE, {
+                            let (map, gate) = (map.add(r * line), gate.add(r * line));
+                            each!(c < SIZE, {
+                                let at = c * self.channels;
+                                d[r][c] = S::gate(S::load(map.add(at)), S::load(gate.add(at)));
+                            });
+                        });
                     }
                 }
             } else {
-                for r in 0..size {
-                    for c in 0..size {
+                for r in 0..SIZE {
+                    for c in 0..SIZE {
                         let (y, x) = (row + r as isize, column + c as isize);
                         let there = y >= 0 && x >= 0 && (y as usize) < grid.height && (x as usize) < grid.width;
                         if there {
                             let pixel = image + y as usize * grid.width + x as usize;
-                            d[r][c] = self.load::<S>(pixel * self.channels + channel, n);
+                            let at = pixel * self.channels + channel;
+                            let value = S::load_part(self.map.as_ptr().add(at), n);
+                            d[r][c] = match self.gate {
+                                None => value,
+                                Some(gate) => S::gate(value, S::load_part(gate.as_ptr().add(at), n)),
+                            };
                         }
                     }
                 }
@@ -409,11 +420,10 @@ impl Space {
         // SAFETY: the caller's.
         unsafe {
             let to = self.start.add(tile * self.tile_step + channel);
-            for r in 0..IN {
-                for c in 0..IN {
-                    S::store(to.add((r * IN + c) * self.place_step), v[r][c]);
-                }
-            }
+            each!(r < IN, {
+                let to = to.add(r * IN * self.place_step);
+                each!(c < IN, { S::store(to.add(c * self.place_step), v[r][c]); });
+            });
         }
     }
 
@@ -427,11 +437,10 @@ impl Space {
         unsafe {
             let from = self.start.add(tile * self.tile_step + channel);
             let mut v = [[S::zero(); IN]; IN];
-            for r in 0..IN {
-                for c in 0..IN {
-                    v[r][c] = S::load(from.add((r * IN + c) * self.place_step));
-                }
-            }
+            each!(r < IN, {
+                let from = from.add(r * IN * self.place_step);
+                each!(c < IN, { v[r][c] = S::load(from.add(c * self.place_step)); });
+            });
             v
         }
     }
@@ -454,7 +463,7 @@ unsafe fn take_input<S: Simd, const IN: usize>(
             // SAFETY: the caller's.
             unsafe {
                 let (row, column) = (row as isize - 1, column as isize - 1);
-                let d = source.tile::<S, IN>(tiles.grid, image, row, column, IN, channel);
+                let d = source.tile::<S, IN, IN>(tiles.grid, image, row, column, channel);
                 let v = both!(line::input::<S, IN>, S, IN, d);
                 to.store::<S, IN>(index, channel, v);
             }
@@ -519,21 +528,31 @@ impl<const IN: usize> Leaf for Block<'_, IN> {
                 let c = m.start.add(place * m.place_step);
                 product::<S>(count, depth, columns, a, b, c, wide, false);
             }
-            for channel in (0..columns).step_by(S::LANES) {
-                let n = S::LANES.min(columns - channel);
-                let bias = finish.bias::<S>(channel, n);
-                for (index, tile) in range.clone().enumerate() {
-                    let (image, row, column) = tiles.at(tile);
-                    let result = both!(line::output::<S, IN>, S, IN, m.load::<S, IN>(index, channel));
-                    for r in 0..out.min(tiles.grid.height - row) {
-                        for c in 0..out.min(tiles.grid.width - column) {
-                            let mut value = S::add(result[r][c], bias);
-                            if finish.relu {
-                                value = S::max(S::zero(), value);
+            for (index, tile) in range.enumerate() {
+                let (image, row, column) = tiles.at(tile);
+                let whole = row + out <= tiles.grid.height && column + out <= tiles.grid.width;
+                let line = tiles.grid.width * columns;
+                let to = y.pointer().add((image + row * tiles.grid.width + column) * columns);
+                for channel in (0..columns).step_by(S::LANES) {
+                    let n = S::LANES.min(columns - channel);
+                    let bias = finish.bias::<S>(channel, n);
+                    let mut result = both!(line::output::<S, IN>, S, IN, m.load::<S, IN>(index, channel));
+                    each!(r < out, {
+                        each!(c < out, {
+                            let value = S::add(result[r][c], bias);
+                            result[r][c] = if finish.relu { S::relu(value) } else { value };
+                        });
+                    });
+                    let to = to.add(channel);
+                    if whole && n == S::LANES {
+                        each!(r < out, {
+                            each!(c < out, { S::store(to.add(r * line + c * columns), result[r][c]); });
+                        });
+                    } else {
+                        for (r, result) in result[..out.min(tiles.grid.height - row)].iter().enumerate() {
+                            for (c, value) in result[..out.min(tiles.grid.width - column)].iter().enumerate() {
+                                S::store_part(to.add(r * line + c * columns), n, *value);
                             }
-                            let pixel = image + (row + r) * tiles.grid.width + column + c;
-                            let to = y.pointer().add(pixel * columns + channel);
-                            if n == S::LANES { S::store(to, value) } else { S::store_part(to, n, value) }
                         }
                     }
                 }
@@ -619,20 +638,25 @@ impl<const IN: usize> Leaf for Taken<'_, IN> {
         unsafe {
             take_input::<S, IN>(self.x, self.tiles, self.range.clone(), v);
             for channel in (0..self.dy.channels).step_by(S::LANES) {
-                let mut sum = S::zero();
-                for (index, tile) in self.range.clone().enumerate() {
-                    let (image, row, column) = self.tiles.at(tile);
-                    let (row, column) = (row as isize, column as isize);
-                    let d = self.dy.tile::<S, IN>(self.tiles.grid, image, row, column, IN - 2, channel);
-                    for line in &d[..IN - 2] {
-                        for value in &line[..IN - 2] {
-                            sum = S::add(sum, *value);
-                        }
-                    }
+                S::store(self.dbias.pointer().add(channel), S::zero());
+            }
+            for (index, tile) in self.range.enumerate() {
+                let (image, row, column) = self.tiles.at(tile);
+                let (row, column) = (row as isize, column as isize);
+                for channel in (0..self.dy.channels).step_by(S::LANES) {
+                    let d = match IN {
+                        4 => self.dy.tile::<S, IN, 2>(self.tiles.grid, image, row, column, channel),
+                        _ => self.dy.tile::<S, IN, 4>(self.tiles.grid, image, row, column, channel),
+                    };
+                    let to = self.dbias.pointer().add(channel);
+                    let mut sum = S::load(to);
+                    each!(r < IN - 2, {
+                        each!(c < IN - 2, { sum = S::add(sum, d[r][c]); });
+                    });
+                    S::store(to, sum);
                     let m = both!(line::output_transposed::<S, IN>, S, IN, d);
                     z.store::<S, IN>(index, channel, m);
                 }
-                S::store(self.dbias.pointer().add(channel), sum);
             }
         }
     }
