@@ -20,6 +20,9 @@ use demc_infer::{Bundle, device};
 use demc_model::ops::{self, Isa, Ops};
 use serde_json::{Value, json};
 
+#[global_allocator]
+static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
+
 /// Steps of a check: the third loss sees what two steps made of the weights.
 const CHECK_STEPS: usize = 3;
 

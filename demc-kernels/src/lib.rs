@@ -16,6 +16,7 @@ pub mod conv3x3;
 pub mod deconv4x4;
 pub mod grid;
 pub mod isa;
+pub mod memory;
 pub mod pool;
 mod product;
 pub mod reduce;

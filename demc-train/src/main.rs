@@ -5,15 +5,20 @@ mod cli;
 use std::process::ExitCode;
 
 use clap::Parser;
+use demc_infer::compute::IsaError;
 use demc_infer::device::DeviceError;
 use demc_train::config::ConfigError;
+
+#[global_allocator]
+static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
 
 fn main() -> ExitCode {
     match cli::run(cli::Arguments::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            let usage = error.is::<ConfigError>() || error.is::<DeviceError>();
+            let usage =
+                error.is::<ConfigError>() || error.is::<DeviceError>() || error.is::<IsaError>();
             ExitCode::from(if usage { 2 } else { 1 })
         }
     }

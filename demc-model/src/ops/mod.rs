@@ -22,6 +22,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use burn::tensor::{Device, Tensor};
 pub use demc_kernels::Isa;
+pub use demc_kernels::memory::Recycler;
 pub use demc_kernels::isa::{UnknownIsa, VARIABLE as ISA_VARIABLE};
 use thiserror::Error;
 

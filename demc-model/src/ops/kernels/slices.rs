@@ -18,7 +18,7 @@ pub(in crate::ops) fn values(tensor: &FlexTensor) -> &[f32] {
 
 /// A buffer to write `len` values into.
 pub(super) fn buffer(len: usize) -> Vec<f32> {
-    vec![0.0; len]
+    demc_kernels::memory::buffer(len)
 }
 
 /// The tensor of these values.
