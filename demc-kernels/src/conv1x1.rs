@@ -29,21 +29,78 @@ pub fn forward(
         .iter()
         .map(|&(first, count)| Packed::new(isa, count, outputs, |k, o| weight[o * total + first + k]))
         .collect();
+    products(isa, xs, &inputs, &weights, Finish { bias: Some(bias), relu, add: false }, y);
+}
+
+/// What becomes of the sum of [`part`].
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Finish<'a> {
+    /// Added to each channel.
+    pub bias: Option<&'a [f32]>,
+    /// Whether the result is rectified.
+    pub relu: bool,
+    /// Whether what `y` holds is added to the sum before that.
+    pub add: bool,
+}
+
+/// A part of a 1x1 convolution, for inference: `y = finish([xs] * W + y)`, W the inputs of `weight` from `first` on.
+///
+/// The convolution is linear until its ReLU, so its inputs can be added one by one as they come, and need not be there at
+/// the same time.
+///
+/// # Shapes
+/// `xs` `[B, H, W, in_i]` each, `weight` `[out, in]` with `first` and the sum of all `in_i` at most `in`, `y`
+/// `[B, H, W, out]`.
+///
+/// # Panics
+/// Where the lengths do not fit.
+pub fn part(isa: Isa, grid: Grid, xs: &[&[f32]], weight: &[f32], first: usize, finish: Finish, y: &mut [f32]) {
+    let outputs = grid.channels(y.len());
+    let total = weight.len() / outputs;
+    let inputs = widths(grid, xs);
+    let end = first + inputs.iter().map(|(_, count)| count).sum::<usize>();
+    assert!(weight.len() == total * outputs && end <= total, "inputs {first} to {end} of {total}");
+    assert!(finish.bias.is_none_or(|bias| bias.len() == outputs), "a bias of {outputs} channels");
+    let weights: Vec<Packed> = inputs
+        .iter()
+        .map(|&(at, count)| Packed::new(isa, count, outputs, |k, o| weight[o * total + first + at + k]))
+        .collect();
+    products(isa, xs, &inputs, &weights, finish, y);
+}
+
+/// The sum of the products of all maps with their weights, finished.
+fn products(
+    isa: Isa,
+    xs: &[&[f32]],
+    inputs: &[(usize, usize)],
+    weights: &[Packed],
+    finish: Finish,
+    y: &mut [f32],
+) {
+    let outputs = weights[0].columns();
     let wide = whole(outputs);
     y.par_chunks_mut(BLOCK * outputs).enumerate().for_each(|(task, y)| {
         let (first, count) = (task * BLOCK, y.len() / outputs);
         let windows: Vec<Window> =
-            xs.iter().zip(&inputs).map(|(x, (_, step))| Window::new(x, *step, first, count)).collect();
+            xs.iter().zip(inputs).map(|(x, (_, step))| Window::new(x, *step, first, count)).collect();
         let terms: Vec<Term> = windows
             .iter()
-            .zip(&inputs)
-            .zip(&weights)
+            .zip(inputs)
+            .zip(weights)
             .map(|((window, (_, step)), weight)| Term { rows: window.rows(), step: *step, weight })
             .collect();
         let mut c = Scratch::take(padded_rows(count) * wide);
-        rows::sum(isa, count, &terms, &mut c, wide);
+        if finish.add {
+            copy(isa, Copy {
+                from: y, from_step: outputs, gate: None, bias: None, relu: false,
+                to: &mut c, to_step: wide, rows: count, channels: outputs,
+            });
+            rows::add_sum(isa, count, &terms, &mut c, wide);
+        } else {
+            rows::sum(isa, count, &terms, &mut c, wide);
+        }
         copy(isa, Copy {
-            from: &c, from_step: wide, gate: None, bias: Some(bias), relu,
+            from: &c, from_step: wide, gate: None, bias: finish.bias, relu: finish.relu,
             to: y, to_step: outputs, rows: count, channels: outputs,
         });
     });
@@ -136,16 +193,21 @@ pub fn backward(
 }
 
 /// First input channel and number of channels of each map.
-fn check(grid: Grid, xs: &[&[f32]], weight: usize, outputs: usize, y: usize) -> Vec<(usize, usize)> {
+fn widths(grid: Grid, xs: &[&[f32]]) -> Vec<(usize, usize)> {
     let mut first = 0;
-    let inputs: Vec<(usize, usize)> = xs
-        .iter()
+    xs.iter()
         .map(|x| {
             let count = grid.channels(x.len());
             first += count;
             (first - count, count)
         })
-        .collect();
+        .collect()
+}
+
+/// The same, once all lengths are known to fit.
+fn check(grid: Grid, xs: &[&[f32]], weight: usize, outputs: usize, y: usize) -> Vec<(usize, usize)> {
+    let inputs = widths(grid, xs);
+    let first: usize = inputs.iter().map(|(_, count)| count).sum();
     assert_eq!(y, grid.pixels() * outputs, "an output of {outputs} channels on {grid:?}");
     assert_eq!(weight, outputs * first, "a weight of {first} to {outputs} channels");
     inputs
@@ -165,6 +227,26 @@ mod tests {
             })
         });
         rows.collect()
+    }
+
+    #[test]
+    fn parts_added_one_by_one_are_the_whole() {
+        let (inputs, outputs) = ([20, 3, 16], 18);
+        for isa in Isa::available() {
+            for grid in grids() {
+                let maps: Vec<Vec<f32>> =
+                    inputs.iter().enumerate().map(|(s, c)| pattern(grid.pixels() * c, s as u32)).collect();
+                let xs: Vec<&[f32]> = maps.iter().map(|x| &x[..]).collect();
+                let (weight, bias) = (pattern(outputs * 39, 7), pattern(outputs, 8));
+                let mut y = vec![f32::NAN; grid.pixels() * outputs];
+                part(isa, grid, &xs[1..], &weight, 20, Finish::default(), &mut y);
+                let last = Finish { bias: Some(&bias), relu: true, add: true };
+                part(isa, grid, &xs[..1], &weight, 0, last, &mut y);
+                let expected =
+                    reference::conv1x1(grid, &concatenated(grid, &xs), &f64s(&weight), &f64s(&bias), true);
+                assert_close(&format!("{isa} {grid:?}"), &y, &expected);
+            }
+        }
     }
 
     #[test]

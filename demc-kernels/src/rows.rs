@@ -78,6 +78,11 @@ impl Packed {
         Packed { depth, columns, values: Scratch::take(depth * whole(columns)) }
     }
 
+    /// Its columns.
+    pub(crate) fn columns(&self) -> usize {
+        self.columns
+    }
+
     /// The packed values; see [`Panels::place`].
     pub(crate) fn values(&mut self) -> Shared {
         Shared::new(&mut self.values)
@@ -101,6 +106,7 @@ pub(crate) struct Term<'a> {
 struct Sum<'a> {
     count: usize,
     terms: &'a [Term<'a>],
+    add: bool,
     c: &'a mut [f32],
     c_step: usize,
 }
@@ -120,7 +126,7 @@ impl Leaf for Sum<'_> {
                 let a = Left { start: term.rows.as_ptr(), row_step: term.step, k_step: 1 };
                 let b = Right::Packed(values.as_ptr());
                 let c = self.c.as_mut_ptr();
-                product::<S>(self.count, *depth, *columns, a, b, c, self.c_step, index > 0);
+                product::<S>(self.count, *depth, *columns, a, b, c, self.c_step, self.add || index > 0);
             }
         }
     }
@@ -132,7 +138,13 @@ impl Leaf for Sum<'_> {
 /// Where a slice is shorter than [`padded_rows`] of `count` need.
 pub(crate) fn sum(isa: Isa, count: usize, terms: &[Term], c: &mut [f32], c_step: usize) {
     // SAFETY: the leaf checks its lengths.
-    unsafe { run(isa, Sum { count, terms, c, c_step }) }
+    unsafe { run(isa, Sum { count, terms, add: false, c, c_step }) }
+}
+
+/// The same, added to what `c` holds.
+pub(crate) fn add_sum(isa: Isa, count: usize, terms: &[Term], c: &mut [f32], c_step: usize) {
+    // SAFETY: the leaf checks its lengths.
+    unsafe { run(isa, Sum { count, terms, add: true, c, c_step }) }
 }
 
 /// Copies rows of channels through vectors: gate, bias, ReLU on the way.
