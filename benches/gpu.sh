@@ -23,11 +23,11 @@ PEER=$ROOT/target/release/peer
 PARITY=$ROOT/target/release/parity
 PARTS=10  # of the memory test
 
-fail() { echo "error: $*" >&2; exit 2; }
+fail() { echo "error: $*" >&2; exit 1; }
 
 # DIR mirrors the repository, so that every script finds its neighbours.
 pack() {
-    local to=$1 features=${2:-wgpu,cuda} built
+    local to=$1 features=${2-wgpu,cuda} built
     cd "$ROOT"
     cargo build --release -p demc-bench --features "$features"
     built=$(cargo test --release -p demc-tests --features "$features" --test parity --no-run --message-format=json |
@@ -48,7 +48,10 @@ make_case() { "$PEER" make --width "$1" --size "${@:2}" --weights "$WORK/weights
 files() { printf -- '--weights\n%s\n--inputs\n%s\n' "$WORK/weights" "$WORK/inputs"; }
 
 # Why a device cannot be used; empty where it can.
-trouble() { { "$PEER" infer $(files) --device "$1" </dev/null >/dev/null; } 2>&1 | tail -1; }
+trouble() { { "$PEER" infer $(files) --device "$1" </dev/null >/dev/null || true; } 2>&1 | grep -a '^error' | tail -1 || true; }
+
+# Notes that something failed; the report is written in a pipe, which keeps no variables.
+bad() { touch "$WORK/bad"; }
 
 parity() {
     local log=$WORK/parity.log
@@ -56,7 +59,7 @@ parity() {
     if DEMC_DEVICE=$1 DEMC_FIXTURES=$ROOT/tests/parity/fixtures "$PARITY" >"$log" 2>&1; then
         grep '^test result' "$log"
     else
-        BAD=1
+        bad
         echo '```'; { grep -E '^test .*FAILED|panicked|^test result|^error' "$log" || tail -5 "$log"; } | head -40; echo '```'
     fi
 }
@@ -67,12 +70,12 @@ speed() {
     if ! command -v "$PYTHON" >/dev/null; then
         echo "No $PYTHON here: this project alone, after 3 steps to warm up."
         make_case 64 4 128 128
-        printf 'step 3\nstep 10\nmemory\n' | "$PEER" train $(files) --lr 1e-3 --device "$device" | sed 's/^/    /' || BAD=1
+        printf 'step 3\nstep 10\nmemory\n' | "$PEER" train $(files) --lr 1e-3 --device "$device" | sed 's/^/    /' || bad
         make_case 64 1 736 1280
-        printf 'step 3\nstep 10\nmemory\n' | "$PEER" infer $(files) --device "$device" | sed 's/^/    /' || BAD=1
+        printf 'step 3\nstep 10\nmemory\n' | "$PEER" infer $(files) --device "$device" | sed 's/^/    /' || bad
         return
     fi
-    "$PYTHON" "$ROOT/benches/peers/run.py" "${command[@]}" --cases $CASES --out "${REPORT%.md}-$device.json" || BAD=1
+    "$PYTHON" "$ROOT/benches/peers/run.py" "${command[@]}" --cases $CASES --out "${REPORT%.md}-$device.json" || bad
 }
 
 # GPU memory and this process's resident set after each part of the steps.
@@ -84,19 +87,19 @@ memory() {
     make_case "$WIDTH" $BATCH
     coproc TRAINING { exec "$PEER" train $(files) --lr 1e-4 --device "$device"; }
     pid=$TRAINING_PID
-    read -r _ <&"${TRAINING[0]}" || { BAD=1; return; }
+    read -r _ <&"${TRAINING[0]}" || { bad; return; }
     for ((i = 1; i <= PARTS; i++)); do
         echo "step $part" >&"${TRAINING[1]}"
-        read -r answer <&"${TRAINING[0]}" || { echo; echo "It ended at step $(((i - 1) * part))."; BAD=1; return; }
+        read -r answer <&"${TRAINING[0]}" || { echo; echo "It ended at step $(((i - 1) * part))."; bad; return; }
         echo "| $((i * part)) | $(gpu_memory) | $(awk '/VmRSS/ {printf "%d", $2 / 1024}' "/proc/$pid/status") |" \
             "$(awk -F'[:}]' '{printf "%.1f", 1000 * $2}' <<<"$answer") |"
     done
     eval "exec ${TRAINING[1]}>&-"
-    wait "$pid" || BAD=1
+    wait "$pid" || bad
 }
 
 gpu_memory() {
-    nvidia-smi --query-gpu=memory.used --format=csv,noheader,nounits 2>/dev/null | paste -sd+ || true
+    nvidia-smi --query-gpu=memory.used --format=csv,noheader,nounits 2>/dev/null | paste -sd+ | grep . || echo -
 }
 
 machine() {
@@ -111,7 +114,7 @@ machine() {
 
 run() {
     local name="" devices="wgpu cuda"
-    CASES="train-4x128x128-c64 train-16x128x128-c64 infer-1280x736-c64" STEPS=500 ROUNDS=5 PYTHON=python3 BAD=0
+    CASES="train-4x128x128-c64 train-16x128x128-c64 infer-1280x736-c64" STEPS=500 ROUNDS=5 PYTHON=python3
     WIDTH=64 BATCH="4 128 128" TORCH_DEVICE=cpu
     command -v nvidia-smi >/dev/null && TORCH_DEVICE=cuda
     while [ $# -gt 0 ]; do
@@ -153,6 +156,7 @@ run() {
         done
     } | tee "$REPORT"
     echo "written: $REPORT" >&2
+    if [ -e "$WORK/bad" ]; then fail "something failed: see the report"; fi
 }
 
 case ${1:-} in
