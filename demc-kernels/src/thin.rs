@@ -6,7 +6,8 @@
 
 use rayon::prelude::*;
 
-use crate::product::{Left, Panels, Right, padded_rows, product};
+use crate::product::{Left, Right, padded_rows, product};
+use crate::rows::{self, BLOCK, Copy, Packed, Term, copy, whole};
 use crate::scratch::Scratch;
 use crate::simd::{Leaf, Simd, run};
 use crate::winograd::Finish;
@@ -41,9 +42,6 @@ impl Axes {
 /// Most values that all taps of the outputs together may have for collecting to pay.
 const MOST_COLLECTED: usize = 36;
 
-/// Pixels of a task.
-const TASK_PIXELS: usize = 96;
-
 /// The neighbour of a pixel at a tap, if it lies in the image.
 #[inline(always)]
 fn neighbour(grid: Grid, row: usize, column: usize, tap: usize) -> Option<isize> {
@@ -66,118 +64,90 @@ struct Source<'a> {
     channels: usize,
 }
 
-impl Source<'_> {
-    fn at(&self, index: usize) -> f32 {
-        match self.gate {
-            Some(gate) if gate[index] <= 0.0 => 0.0,
-            _ => self.map[index],
-        }
-    }
+/// The neighbourhoods of some pixels as rows of `9 * channels` values, `step` values apart.
+struct Gather<'a> {
+    source: Source<'a>,
+    grid: Grid,
+    pixels: std::ops::Range<usize>,
+    /// Whether a row holds the pixels that this one gives to, instead of those that it takes from.
+    mirrored: bool,
+    rows: &'a mut [f32],
+    step: usize,
+}
 
-    /// The neighbourhoods of some pixels as rows, `step` values apart; `mirrored` for those that a pixel gives to.
-    fn gather(&self, grid: Grid, pixels: std::ops::Range<usize>, mirrored: bool, rows: &mut [f32], step: usize) {
-        let channels = self.channels;
-        for (pixel, row) in pixels.zip(rows.chunks_mut(step)) {
+impl Leaf for Gather<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        let Gather { source, grid, pixels, mirrored, rows, step } = self;
+        let channels = source.channels;
+        assert!(rows.len() >= pixels.len() * step && step >= 9 * channels, "room for the neighbourhoods");
+        assert!(pixels.end * channels <= source.map.len(), "pixels of the map");
+        for (pixel, row) in pixels.zip(rows.chunks_exact_mut(step)) {
             let (y, x) = place(grid, pixel);
+            let inside = y > 0 && y + 1 < grid.height && x > 0 && x + 1 < grid.width;
+            if inside && !mirrored {
+                // Three pixels side by side are three taps side by side.
+                for line in 0..3 {
+                    let first = (pixel + line * grid.width - grid.width - 1) * channels;
+                    // SAFETY: the pixel's eight neighbours lie in the image.
+                    unsafe { copy_part::<S>(source, first, &mut row[line * 3 * channels..], 3 * channels) };
+                }
+                continue;
+            }
             for tap in 0..9 {
                 let to = &mut row[tap * channels..(tap + 1) * channels];
                 match neighbour(grid, y, x, if mirrored { 8 - tap } else { tap }) {
                     None => to.fill(0.0),
                     Some(offset) => {
                         let first = pixel.wrapping_add_signed(offset) * channels;
-                        match self.gate {
-                            None => to.copy_from_slice(&self.map[first..first + channels]),
-                            Some(_) => {
-                                for (i, to) in to.iter_mut().enumerate() {
-                                    *to = self.at(first + i);
-                                }
-                            }
-                        }
+                        // SAFETY: the neighbour lies in the image.
+                        unsafe { copy_part::<S>(source, first, to, channels) };
                     }
                 }
             }
         }
+    }
+}
+
+/// Copies `count` values from value `first`, gated.
+///
+/// # Safety
+/// The machine has the path of `S`, and the map and its gate that many values there.
+#[inline(always)]
+unsafe fn copy_part<S: Simd>(source: Source, first: usize, to: &mut [f32], count: usize) {
+    assert!(to.len() >= count);
+    for at in (0..count).step_by(S::LANES) {
+        let n = S::LANES.min(count - at);
+        // SAFETY: `n` values from `at` on are there.
+        unsafe {
+            let mut v = S::load_part(source.map.as_ptr().add(first + at), n);
+            if let Some(gate) = source.gate {
+                v = S::gate(v, S::load_part(gate.as_ptr().add(first + at), n));
+            }
+            S::store_part(to.as_mut_ptr().add(at), n, v);
+        }
+    }
+}
+
+impl Source<'_> {
+    /// See [`Gather`].
+    fn gather(&self, isa: Isa, grid: Grid, pixels: std::ops::Range<usize>, mirrored: bool, rows: &mut [f32], step: usize) {
+        assert!(self.gate.is_none_or(|gate| gate.len() == self.map.len()), "a gate of the map's size");
+        let leaf = Gather { source: *self, grid, pixels, mirrored, rows, step };
+        // SAFETY: the leaf checks its lengths, the gate's was checked.
+        unsafe { run(isa, leaf) }
     }
 
     /// Some pixels themselves as rows, `step` values apart.
-    fn copy(&self, pixels: std::ops::Range<usize>, rows: &mut [f32], step: usize) {
-        let channels = self.channels;
-        for (pixel, row) in pixels.zip(rows.chunks_mut(step)) {
-            let first = pixel * channels;
-            match self.gate {
-                None => row[..channels].copy_from_slice(&self.map[first..first + channels]),
-                Some(_) => {
-                    for (i, to) in row[..channels].iter_mut().enumerate() {
-                        *to = self.at(first + i);
-                    }
-                }
-            }
-        }
+    fn copy(&self, isa: Isa, pixels: std::ops::Range<usize>, rows: &mut [f32], step: usize) {
+        let (first, channels) = (pixels.start * self.channels, self.channels);
+        copy(isa, Copy {
+            from: &self.map[first..], from_step: channels, gate: self.gate.map(|gate| &gate[first..]),
+            bias: None, relu: false, to: rows, to_step: step, rows: pixels.len(), channels,
+        });
     }
-}
-
-/// One product of packed rows with packed weights.
-struct Multiply<'a> {
-    rows: usize,
-    depth: usize,
-    columns: usize,
-    a: &'a [f32],
-    a_step: usize,
-    b: &'a [f32],
-    c: &'a mut [f32],
-    c_step: usize,
-}
-
-impl Leaf for Multiply<'_> {
-    type Out = ();
-
-    #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
-        let rows = padded_rows(self.rows);
-        assert!(self.a.len() >= (rows - 1) * self.a_step + self.depth && self.c.len() >= rows * self.c_step);
-        // SAFETY: just checked; the weights were packed for this depth and these columns.
-        unsafe {
-            let a = Left { start: self.a.as_ptr(), row_step: self.a_step, k_step: 1 };
-            let b = Right::Packed(self.b.as_ptr());
-            product::<S>(self.rows, self.depth, self.columns, a, b, self.c.as_mut_ptr(), self.c_step, false);
-        }
-    }
-}
-
-/// Packs a matrix `[depth, columns]` given by its values for [`Right::Packed`].
-pub(crate) struct PackRight<'a, F> {
-    pub(crate) depth: usize,
-    pub(crate) columns: usize,
-    pub(crate) value: F,
-    pub(crate) to: &'a mut [f32],
-}
-
-impl<F: Fn(usize, usize) -> f32> Leaf for PackRight<'_, F> {
-    type Out = ();
-
-    #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
-        let panels = Panels::new::<S>(self.columns);
-        for k in 0..self.depth {
-            for column in 0..panels.padded {
-                let value = if column < self.columns { (self.value)(k, column) } else { 0.0 };
-                self.to[panels.place(self.depth, k, column)] = value;
-            }
-        }
-    }
-}
-
-/// Columns rounded up to what any path's vectors fill.
-pub(crate) fn whole(columns: usize) -> usize {
-    columns.next_multiple_of(16)
-}
-
-/// A matrix packed for [`Right::Packed`].
-pub(crate) fn packed(isa: Isa, depth: usize, columns: usize, value: impl Fn(usize, usize) -> f32) -> Scratch {
-    let mut to = Scratch::take(depth * whole(columns));
-    // SAFETY: safe code but for its vectors' width.
-    unsafe { run(isa, PackRight { depth, columns, value, to: &mut to }) };
-    to
 }
 
 /// `y = finish(weight * x)`, `x` gated where a gate is given.
@@ -200,34 +170,23 @@ pub(crate) fn convolve(
     }
 }
 
-/// Bias and ReLU of one value.
-#[inline(always)]
-fn finished(finish: Finish, channel: usize, value: f32) -> f32 {
-    let value = value + finish.bias.map_or(0.0, |bias| bias[channel]);
-    // As the vectors' ReLU: a NaN stays.
-    if finish.relu && value < 0.0 { 0.0 } else { value }
-}
-
 /// By rows of neighbourhoods.
 fn spread(isa: Isa, grid: Grid, source: Source, weight: &[f32], axes: Axes, finish: Finish, y: &mut [f32]) {
     let (depth, columns) = (9 * axes.inputs, axes.outputs);
-    let b = packed(isa, depth, columns, |k, column| {
+    let b = Packed::new(isa, depth, columns, |k, column| {
         weight[axes.place(k % axes.inputs, column, k / axes.inputs)]
     });
     let wide = whole(columns);
-    y.par_chunks_mut(TASK_PIXELS * columns).enumerate().for_each(|(task, y)| {
-        let (first, count) = (task * TASK_PIXELS, y.len() / columns);
+    y.par_chunks_mut(BLOCK * columns).enumerate().for_each(|(task, y)| {
+        let (first, count) = (task * BLOCK, y.len() / columns);
         let mut a = Scratch::take(padded_rows(count) * depth);
         let mut c = Scratch::take(padded_rows(count) * wide);
-        source.gather(grid, first..first + count, false, &mut a, depth);
-        let leaf = Multiply { rows: count, depth, columns, a: &a, a_step: depth, b: &b, c: &mut c, c_step: wide };
-        // SAFETY: lengths are checked within.
-        unsafe { run(isa, leaf) };
-        for (y, c) in y.chunks_mut(columns).zip(c.chunks(wide)) {
-            for (channel, (y, c)) in y.iter_mut().zip(c).enumerate() {
-                *y = finished(finish, channel, *c);
-            }
-        }
+        source.gather(isa, grid, first..first + count, false, &mut a, depth);
+        rows::sum(isa, count, &[Term { rows: &a, step: depth, weight: &b }], &mut c, wide);
+        copy(isa, Copy {
+            from: &c, from_step: wide, gate: None, bias: finish.bias, relu: finish.relu,
+            to: y, to_step: columns, rows: count, channels: columns,
+        });
     });
 }
 
@@ -235,73 +194,65 @@ fn spread(isa: Isa, grid: Grid, source: Source, weight: &[f32], axes: Axes, fini
 fn collect(isa: Isa, grid: Grid, source: Source, weight: &[f32], axes: Axes, finish: Finish, y: &mut [f32]) {
     let (depth, outputs) = (axes.inputs, axes.outputs);
     let columns = 9 * outputs;
-    let b = packed(isa, depth, columns, |k, column| {
+    let b = Packed::new(isa, depth, columns, |k, column| {
         weight[axes.place(k, column % outputs, column / outputs)]
     });
     let wide = whole(columns);
     let image = grid.height * grid.width;
     // An image at a time, so that what is collected is still in a cache.
-    let mut given = Scratch::take((image.next_multiple_of(TASK_PIXELS) + TASK_PIXELS) * wide);
+    let mut given = Scratch::take((image.next_multiple_of(BLOCK) + BLOCK) * wide);
     for (index, y) in y.chunks_mut(image * outputs).enumerate() {
-        given.par_chunks_mut(TASK_PIXELS * wide).enumerate().for_each(|(task, c)| {
-            let first = task * TASK_PIXELS;
-            if first >= image {
-                return;
-            }
-            let count = TASK_PIXELS.min(image - first);
+        given.par_chunks_mut(BLOCK * wide).take(image.div_ceil(BLOCK)).enumerate().for_each(|(task, c)| {
+            let first = task * BLOCK;
+            let count = BLOCK.min(image - first);
             let mut a = Scratch::take(padded_rows(count) * depth);
-            source.copy(index * image + first..index * image + first + count, &mut a, depth);
-            let leaf = Multiply { rows: count, depth, columns, a: &a, a_step: depth, b: &b, c, c_step: wide };
-            // SAFETY: lengths are checked within.
-            unsafe { run(isa, leaf) };
+            source.copy(isa, index * image + first..index * image + first + count, &mut a, depth);
+            rows::sum(isa, count, &[Term { rows: &a, step: depth, weight: &b }], c, wide);
         });
         y.par_chunks_mut(grid.width * outputs).enumerate().for_each(|(row, y)| {
-            for (column, y) in y.chunks_mut(outputs).enumerate() {
-                let pixel = row * grid.width + column;
-                let mut sums = [0.0; MOST_COLLECTED / 9];
-                for tap in 0..9 {
-                    if let Some(offset) = neighbour(grid, row, column, tap) {
-                        let from = pixel.wrapping_add_signed(offset) * wide + tap * outputs;
-                        for (sum, value) in sums.iter_mut().zip(&given[from..from + outputs]) {
-                            *sum += value;
-                        }
-                    }
-                }
-                for (channel, (y, sum)) in y.iter_mut().zip(sums).enumerate() {
-                    *y = finished(finish, channel, sum);
-                }
-            }
+            let leaf = Collect { grid, given: &given, wide, finish, row, outputs, y };
+            // SAFETY: the leaf checks its lengths.
+            unsafe { run(isa, leaf) }
         });
     }
 }
 
-/// Adds a product whose reduction runs over pixels.
-pub(crate) struct Accumulate<'a> {
-    pub(crate) rows: usize,
-    pub(crate) pixels: usize,
-    pub(crate) columns: usize,
-    pub(crate) a: &'a [f32],
-    pub(crate) a_step: usize,
-    pub(crate) b: &'a [f32],
-    pub(crate) b_step: usize,
-    pub(crate) c: &'a mut [f32],
-    pub(crate) c_step: usize,
+/// Sums what the neighbours of a row of pixels give to it.
+struct Collect<'a> {
+    grid: Grid,
+    given: &'a [f32],
+    wide: usize,
+    finish: Finish<'a>,
+    row: usize,
+    outputs: usize,
+    y: &'a mut [f32],
 }
 
-impl Leaf for Accumulate<'_> {
+impl Leaf for Collect<'_> {
     type Out = ();
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let rows = padded_rows(self.rows);
-        assert!(self.pixels > 0 && self.a.len() >= (self.pixels - 1) * self.a_step + rows);
-        assert!(self.b.len() >= (self.pixels - 1) * self.b_step + self.columns.next_multiple_of(S::LANES));
-        assert!(self.c.len() >= (rows - 1) * self.c_step + self.columns.next_multiple_of(S::LANES));
-        // SAFETY: just checked.
-        unsafe {
-            let a = Left { start: self.a.as_ptr(), row_step: 1, k_step: self.a_step };
-            let b = Right::Rows { start: self.b.as_ptr(), step: self.b_step };
-            product::<S>(self.rows, self.pixels, self.columns, a, b, self.c.as_mut_ptr(), self.c_step, true);
+        let Collect { grid, given, wide, finish, row, outputs, y } = self;
+        assert!(y.len() == grid.width * outputs && row < grid.height);
+        assert!(given.len() >= grid.height * grid.width * wide && wide >= 9 * outputs);
+        for (column, y) in y.chunks_exact_mut(outputs).enumerate() {
+            let pixel = row * grid.width + column;
+            for channel in (0..outputs).step_by(S::LANES) {
+                let n = S::LANES.min(outputs - channel);
+                // SAFETY: neighbours are pixels of the image, each with `9 * outputs` values.
+                unsafe {
+                    let mut sum = finish.bias::<S>(channel, n);
+                    for tap in 0..9 {
+                        if let Some(offset) = neighbour(grid, row, column, tap) {
+                            let from = pixel.wrapping_add_signed(offset) * wide + tap * outputs + channel;
+                            sum = S::add(sum, S::load_part(given.as_ptr().add(from), n));
+                        }
+                    }
+                    let value = if finish.relu { S::relu(sum) } else { sum };
+                    S::store_part(y.as_mut_ptr().add(channel), n, value);
+                }
+            }
         }
     }
 }
@@ -325,34 +276,30 @@ pub(crate) fn gradient(
     // The thin side is the one whose neighbourhoods become rows.
     let by_output = 9 * outputs <= MOST_COLLECTED && inputs > outputs;
     let (rows, columns) = if by_output { (inputs, 9 * outputs) } else { (9 * inputs, outputs) };
-    let (tall, wide) = (padded_rows(rows), whole(columns));
+    // One row more, of ones: its gradient is the sum of `dy`, the bias's.
+    let (tall, wide) = (padded_rows(rows + 1), whole(columns));
     let pixels = grid.pixels();
-    let stretch = pixels.div_ceil(STRETCHES).next_multiple_of(TASK_PIXELS);
+    let stretch = pixels.div_ceil(STRETCHES).next_multiple_of(BLOCK);
     let stretches = pixels.div_ceil(stretch);
     let size = tall * wide;
     let mut sums = Scratch::zeroed(stretches * size);
-    let mut biases = vec![0.0f64; stretches * outputs];
-    sums.par_chunks_mut(size).zip(biases.par_chunks_mut(outputs)).enumerate().for_each(|(index, (sum, bias))| {
+    sums.par_chunks_mut(size).enumerate().for_each(|(index, sum)| {
         let end = ((index + 1) * stretch).min(pixels);
-        let mut a = Scratch::zeroed(TASK_PIXELS * tall);
-        let mut b = Scratch::zeroed(TASK_PIXELS * wide);
-        for first in (index * stretch..end).step_by(TASK_PIXELS) {
-            let range = first..(first + TASK_PIXELS).min(end);
+        let mut a = Scratch::zeroed(BLOCK * tall);
+        a.iter_mut().skip(rows).step_by(tall).for_each(|one| *one = 1.0);
+        let mut b = Scratch::zeroed(BLOCK * wide);
+        for first in (index * stretch..end).step_by(BLOCK) {
+            let range = first..(first + BLOCK).min(end);
             let count = range.len();
-            for pixel in range.clone() {
-                for (channel, bias) in bias.iter_mut().enumerate() {
-                    *bias += f64::from(dy.at(pixel * outputs + channel));
-                }
-            }
             if by_output {
-                x.copy(range.clone(), &mut a, tall);
-                dy.gather(grid, range, true, &mut b, wide);
+                x.copy(isa, range.clone(), &mut a, tall);
+                dy.gather(isa, grid, range, true, &mut b, wide);
             } else {
-                x.gather(grid, range.clone(), false, &mut a, tall);
-                dy.copy(range, &mut b, wide);
+                x.gather(isa, grid, range.clone(), false, &mut a, tall);
+                dy.copy(isa, range, &mut b, wide);
             }
             let leaf = Accumulate {
-                rows, pixels: count, columns, a: &a, a_step: tall, b: &b, b_step: wide, c: sum, c_step: wide,
+                rows: rows + 1, pixels: count, columns, a: &a, a_step: tall, b: &b, b_step: wide, c: sum, c_step: wide,
             };
             // SAFETY: lengths are checked within.
             unsafe { run(isa, leaf) };
@@ -370,6 +317,38 @@ pub(crate) fn gradient(
                 };
             }
         }
-        dbias[o] = biases[o..].iter().step_by(outputs).sum::<f64>() as f32;
+        // Among the neighbourhoods of `dy` the middle tap is `dy` itself.
+        dbias[o] = total(rows, if by_output { 4 * outputs + o } else { o });
+    }
+}
+
+/// Adds a product whose reduction runs over pixels.
+struct Accumulate<'a> {
+    rows: usize,
+    pixels: usize,
+    columns: usize,
+    a: &'a [f32],
+    a_step: usize,
+    b: &'a [f32],
+    b_step: usize,
+    c: &'a mut [f32],
+    c_step: usize,
+}
+
+impl Leaf for Accumulate<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        let rows = padded_rows(self.rows);
+        assert!(self.pixels > 0 && self.a.len() >= (self.pixels - 1) * self.a_step + rows);
+        assert!(self.b.len() >= (self.pixels - 1) * self.b_step + self.columns.next_multiple_of(S::LANES));
+        assert!(self.c.len() >= (rows - 1) * self.c_step + self.columns.next_multiple_of(S::LANES));
+        // SAFETY: just checked.
+        unsafe {
+            let a = Left { start: self.a.as_ptr(), row_step: 1, k_step: self.a_step };
+            let b = Right::Rows { start: self.b.as_ptr(), step: self.b_step };
+            product::<S>(self.rows, self.pixels, self.columns, a, b, self.c.as_mut_ptr(), self.c_step, true);
+        }
     }
 }
