@@ -70,7 +70,7 @@ speed() {
     if ! command -v "$PYTHON" >/dev/null; then
         echo "No $PYTHON here: this project alone, after 3 steps to warm up."
         make_case 64 4 128 128
-        printf 'step 3\nstep 10\nmemory\n' | "$PEER" train $(files) --lr 1e-3 --device "$device" | sed 's/^/    /' || bad
+        printf 'step 3\nstep 10\nmemory\n' | "$PEER" train $(files) --lr 1e-4 --device "$device" | sed 's/^/    /' || bad
         make_case 64 1 736 1280
         printf 'step 3\nstep 10\nmemory\n' | "$PEER" infer $(files) --device "$device" | sed 's/^/    /' || bad
         return
