@@ -18,6 +18,10 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
+/// That of the binaries.
+#[global_allocator]
+static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
+
 const BATCH: usize = 4;
 const PATCH: usize = 128;
 const ROUNDS: usize = 7;

@@ -19,6 +19,10 @@ use demc_bench::contender::Training;
 use demc_bench::stopwatch::Spread;
 use demc_data::{BatchLoader, ChannelLayout, DataConfig, Dataset, PatchSource, Statistics};
 
+/// That of the binaries.
+#[global_allocator]
+static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
+
 const ROUNDS: usize = 5;
 const BATCH: usize = 4;
 const PATCH: usize = 128;
