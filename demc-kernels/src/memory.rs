@@ -2,8 +2,8 @@
 //!
 //! A training step asks for the same few hundred maps every time. The system's allocator gives each back to the system
 //! and fetches it again, at a page fault every 4 KiB and a page's zeros written before ours: a seventh of a step's time at
-//! C = 64. [`Recycler`] keeps freed blocks of 2 MiB and more for the next one, on pages of 2 MiB where Linux has them, and
-//! leaves everything smaller to the system's allocator.
+//! C = 64. [`Recycler`] keeps freed blocks of 2 MiB and more for the next ones, on Linux, on pages of 2 MiB where there
+//! are; it holds no more than the process once used, and leaves everything smaller to the system's allocator.
 //!
 //! ```no_run
 //! #[global_allocator]
@@ -13,253 +13,255 @@
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Mutex;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 
-/// A large page: where blocks begin, and the smallest that is one, bytes.
-const PAGE: usize = 2 << 20;
+/// The smallest block that is large, bytes: a large page of Linux.
+const LARGE: usize = 2 << 20;
 
 /// What sizes are rounded up to, bytes.
 const GRAIN: usize = 64 << 10;
 
 /// Blocks that can be kept at a time; more go back to the system.
-const MOST_KEPT: usize = 256;
+const MOST_KEPT: usize = 512;
 
-/// Share of the bytes in use that may be kept beside them: 1 / this. More is hardly faster, and is memory.
-const KEPT_SHARE: usize = 8;
-
-/// Bytes that are kept however little is in use.
-const ALWAYS_KEPT: usize = 64 << 20;
-
-/// The system's allocator, but for large blocks, which it keeps.
+/// The system's allocator, but on Linux for large blocks, which it keeps.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Recycler;
 
-/// A free block.
+/// A stretch of free memory.
 #[derive(Clone, Copy)]
 struct Block {
     address: usize,
     size: usize,
 }
 
-/// The free blocks: an array, because an allocator cannot allocate.
-struct Free {
+/// The memory that is kept: an array, because an allocator cannot allocate.
+struct Kept {
     blocks: [Block; MOST_KEPT],
     count: usize,
+    /// Bytes of all blocks.
     bytes: usize,
+    /// Bytes that the process uses, and the most so far.
+    used: usize,
+    most_used: usize,
 }
 
-static FREE: Mutex<Free> = Mutex::new(Free {
+static KEPT: Mutex<Kept> = Mutex::new(Kept {
     blocks: [Block { address: 0, size: 0 }; MOST_KEPT],
     count: 0,
     bytes: 0,
+    used: 0,
+    most_used: 0,
 });
-static USED: AtomicUsize = AtomicUsize::new(0);
 /// Whether this is the allocator of the process.
 static INSTALLED: AtomicBool = AtomicBool::new(false);
 
-impl Free {
-    /// A block of exactly this size: sizes repeat, and a block's size can be told from what was asked for.
-    fn take(&mut self, size: usize) -> Option<Block> {
-        let index = (0..self.count).rev().find(|i| self.blocks[*i].size == size)?;
+impl Kept {
+    fn remove(&mut self, index: usize) -> Block {
         let block = self.blocks[index];
         self.count -= 1;
         self.blocks[index] = self.blocks[self.count];
         self.bytes -= block.size;
-        Some(block)
+        block
     }
 
-    /// Whether the block was kept.
-    fn put(&mut self, block: Block) -> bool {
-        // What a phase of a run leaves behind goes back to the system.
-        let most = (USED.load(Ordering::Relaxed) / KEPT_SHARE).max(ALWAYS_KEPT);
-        let kept = self.count < MOST_KEPT && self.bytes + block.size <= most;
-        if kept {
-            self.blocks[self.count] = block;
-            self.count += 1;
-            self.bytes += block.size;
+    fn insert(&mut self, block: Block) {
+        self.blocks[self.count] = block;
+        self.count += 1;
+        self.bytes += block.size;
+    }
+
+    /// Memory of this size, cut from the smallest block that has it.
+    fn take(&mut self, size: usize) -> Option<usize> {
+        self.used += size;
+        self.most_used = self.most_used.max(self.used);
+        let fitting = (0..self.count).filter(|i| self.blocks[*i].size >= size);
+        let block = fitting.min_by_key(|i| self.blocks[*i].size).map(|i| self.remove(i))?;
+        if block.size > size {
+            // From the end, so that what stays begins where a large page does.
+            self.insert(Block { address: block.address, size: block.size - size });
         }
-        kept
+        Some(block.address + block.size - size)
+    }
+
+    /// Takes memory back, joined with its neighbours; what is to go to the system, if anything.
+    fn put(&mut self, mut block: Block) -> Option<Block> {
+        self.used -= block.size;
+        // The process never holds more than it once used: what a phase of a run leaves behind goes back.
+        if self.used + self.bytes + block.size > self.most_used {
+            return Some(block);
+        }
+        for index in (0..self.count).rev() {
+            let other = self.blocks[index];
+            let (below, above) = (other.address + other.size == block.address, block.address + block.size == other.address);
+            if below || above {
+                self.remove(index);
+                block = Block { address: block.address.min(other.address), size: block.size + other.size };
+            }
+        }
+        if self.count == MOST_KEPT {
+            return Some(block);
+        }
+        self.insert(block);
+        None
     }
 }
 
-fn free() -> std::sync::MutexGuard<'static, Free> {
-    FREE.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
+fn kept() -> std::sync::MutexGuard<'static, Kept> {
+    KEPT.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
 }
 
-fn is_large(layout: Layout) -> bool {
-    layout.size() >= PAGE && layout.align() <= PAGE
+/// Bytes of the block for an allocation; none where the system's allocator has it.
+fn block_size(size: usize, align: usize) -> Option<usize> {
+    let large = cfg!(all(target_os = "linux", not(miri))) && size >= LARGE && align <= GRAIN;
+    large.then(|| size.checked_next_multiple_of(GRAIN)).flatten()
 }
 
-/// The layout of the block for an allocation of this size.
-fn block_layout(size: usize) -> Layout {
-    let size = size.checked_next_multiple_of(GRAIN).unwrap_or(size);
-    // A power of two, and sizes were a Layout's before they were rounded up.
-    Layout::from_size_align(size, PAGE).unwrap_or_else(|_| Layout::new::<()>())
-}
-
-/// A block for `size` bytes, all of them initialised, and whether they are zeros; null where there is no memory.
+/// A block, all of it initialised, and whether it is zeros; null where there is no memory.
 fn block(size: usize) -> (*mut u8, bool) {
-    let layout = block_layout(size);
-    if layout.size() < size {
-        return (std::ptr::null_mut(), false);
+    match kept().take(size) {
+        Some(address) => (std::ptr::with_exposed_provenance_mut(address), false),
+        None => (system::map(size), true),
     }
-    USED.fetch_add(layout.size(), Ordering::Relaxed);
-    if let Some(block) = free().take(layout.size()) {
-        return (std::ptr::with_exposed_provenance_mut(block.address), false);
-    }
-    let pointer = system::fresh(layout);
-    if pointer.is_null() {
-        USED.fetch_sub(layout.size(), Ordering::Relaxed);
-    }
-    (pointer, true)
 }
 
-/// Where blocks come from: zeroed memory at a multiple of [`PAGE`].
+/// Takes back a block.
+///
+/// # Safety
+/// It came from [`block`], of this size, and nobody uses it any more.
+unsafe fn release(pointer: *mut u8, size: usize) {
+    let surplus = kept().put(Block { address: pointer.expose_provenance(), size });
+    if let Some(Block { address, size }) = surplus {
+        // SAFETY: the caller's; joined blocks are whole pages that were mapped, and nobody's.
+        unsafe { system::unmap(std::ptr::with_exposed_provenance_mut(address), size) };
+    }
+}
+
+/// Where blocks come from: the kernel.
 #[cfg(all(target_os = "linux", not(miri)))]
 mod system {
-    use super::PAGE;
-    use std::alloc::Layout;
+    use super::LARGE;
 
-    /// A block from the kernel itself, which cuts it to size; null where there is none.
-    pub(super) fn fresh(layout: Layout) -> *mut u8 {
-        let Some(size) = layout.size().checked_add(PAGE) else {
+    /// Zeroed pages at a multiple of a large page; null where there are none.
+    pub(super) fn map(size: usize) -> *mut u8 {
+        let Some(with_room) = size.checked_add(LARGE) else {
             return std::ptr::null_mut();
         };
         let (access, kind) = (libc::PROT_READ | libc::PROT_WRITE, libc::MAP_PRIVATE | libc::MAP_ANONYMOUS);
         // SAFETY: a mapping at an address of the kernel's choice; what is unmapped is its own unused ends.
         unsafe {
-            let start = libc::mmap(std::ptr::null_mut(), size, access, kind, -1, 0);
+            let start = libc::mmap(std::ptr::null_mut(), with_room, access, kind, -1, 0);
             if start == libc::MAP_FAILED {
                 return std::ptr::null_mut();
             }
-            let head = start.align_offset(PAGE);
+            let head = start.align_offset(LARGE);
             let block = start.byte_add(head);
             if head > 0 {
                 libc::munmap(start, head);
             }
-            if PAGE > head {
-                libc::munmap(block.byte_add(layout.size()), PAGE - head);
+            if LARGE > head {
+                libc::munmap(block.byte_add(size), LARGE - head);
             }
             // Refused by kernels without large pages: small ones do as well.
-            libc::madvise(block, layout.size(), libc::MADV_HUGEPAGE);
+            libc::madvise(block, size, libc::MADV_HUGEPAGE);
             block.cast()
         }
     }
 
-    /// Gives a block back.
+    /// Gives pages back.
     ///
     /// # Safety
-    /// It came from [`fresh`] with this layout, and nobody uses it any more.
-    pub(super) unsafe fn give_back(block: *mut u8, layout: Layout) {
+    /// They came from [`map`], and nobody uses them any more.
+    pub(super) unsafe fn unmap(block: *mut u8, size: usize) {
         // SAFETY: the caller's.
-        unsafe { libc::munmap(block.cast(), layout.size()) };
+        unsafe { libc::munmap(block.cast(), size) };
     }
 }
 
-/// Where blocks come from: zeroed memory at a multiple of [`PAGE`].
+/// Nowhere: no block is large.
 #[cfg(not(all(target_os = "linux", not(miri))))]
 mod system {
-    use std::alloc::{GlobalAlloc, Layout, System};
-
-    /// A block of the system's allocator; null where there is none.
-    pub(super) fn fresh(layout: Layout) -> *mut u8 {
-        // SAFETY: the layout is that of a large block, not empty.
-        unsafe { System.alloc_zeroed(layout) }
+    pub(super) fn map(_size: usize) -> *mut u8 {
+        std::ptr::null_mut()
     }
 
-    /// Gives a block back.
-    ///
-    /// # Safety
-    /// It came from [`fresh`] with this layout, and nobody uses it any more.
-    pub(super) unsafe fn give_back(block: *mut u8, layout: Layout) {
-        // SAFETY: the caller's.
-        unsafe { System.dealloc(block, layout) }
-    }
-}
-
-/// Takes back a block for `size` bytes.
-///
-/// # Safety
-/// It came from [`block`], for the same size, and nobody uses it any more.
-unsafe fn release(pointer: *mut u8, size: usize) {
-    let layout = block_layout(size);
-    USED.fetch_sub(layout.size(), Ordering::Relaxed);
-    let block = Block { address: pointer.expose_provenance(), size: layout.size() };
-    if !free().put(block) {
-        // SAFETY: the caller's; the layout is that of its size.
-        unsafe { system::give_back(pointer, layout) };
-    }
+    pub(super) unsafe fn unmap(_block: *mut u8, _size: usize) {}
 }
 
 /// A buffer of `len` values to write into: those of an earlier user where [`Recycler`] is the process's allocator, so
 /// that no time goes into zeros that nobody reads; zeros elsewhere.
 pub fn buffer(len: usize) -> Vec<f32> {
-    let size = len * size_of::<f32>();
-    if size < PAGE || !INSTALLED.load(Ordering::Relaxed) {
+    let size = len.checked_mul(size_of::<f32>()).and_then(|size| block_size(size, align_of::<f32>()));
+    let Some(size) = size.filter(|_| INSTALLED.load(Ordering::Relaxed)) else {
         return vec![0.0; len];
-    }
+    };
     let (pointer, _) = block(size);
     assert!(!pointer.is_null(), "no memory for {size} bytes");
-    // SAFETY: the block is initialised, for every block is zeroed once, and `len` values fit. Recycler, which is the
+    // SAFETY: the block is initialised, for the kernel's pages are zeros, and `len` values fit. Recycler, which is the
     // process's allocator, takes it back by the layout of `len` values.
     unsafe { Vec::from_raw_parts(pointer.cast(), len, len) }
 }
 
-// SAFETY: large blocks come from `System` with a layout that depends on the size alone, so that `dealloc` finds it
-// again; one that was kept was given up before. All else is `System`'s.
+// SAFETY: whether an allocation is a block, and of which size, depends on its layout alone, so that `dealloc` and
+// `realloc` find it again; blocks are disjoint. All else is `System`'s.
 unsafe impl GlobalAlloc for Recycler {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        if is_large(layout) {
-            INSTALLED.store(true, Ordering::Relaxed);
-            return block(layout.size()).0;
+        match block_size(layout.size(), layout.align()) {
+            Some(size) => {
+                INSTALLED.store(true, Ordering::Relaxed);
+                block(size).0
+            }
+            // SAFETY: the caller's.
+            None => unsafe { System.alloc(layout) },
         }
-        // SAFETY: the caller's.
-        unsafe { System.alloc(layout) }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
-        if !is_large(layout) {
+        match block_size(layout.size(), layout.align()) {
+            Some(size) => {
+                INSTALLED.store(true, Ordering::Relaxed);
+                let (pointer, zeros) = block(size);
+                if !zeros && !pointer.is_null() {
+                    // SAFETY: the block holds at least this many bytes.
+                    unsafe { pointer.write_bytes(0, layout.size()) };
+                }
+                pointer
+            }
             // SAFETY: the caller's.
-            return unsafe { System.alloc_zeroed(layout) };
+            None => unsafe { System.alloc_zeroed(layout) },
         }
-        INSTALLED.store(true, Ordering::Relaxed);
-        let (pointer, zeros) = block(layout.size());
-        if !zeros && !pointer.is_null() {
-            // SAFETY: the block holds at least this many bytes.
-            unsafe { pointer.write_bytes(0, layout.size()) };
-        }
-        pointer
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        if !is_large(layout) {
-            // SAFETY: the caller's.
-            return unsafe { System.dealloc(pointer, layout) };
+        // SAFETY: the caller's; a block's size is that of its layout.
+        unsafe {
+            match block_size(layout.size(), layout.align()) {
+                Some(size) => release(pointer, size),
+                None => System.dealloc(pointer, layout),
+            }
         }
-        // SAFETY: a large layout's pointer is a block's.
-        unsafe { release(pointer, layout.size()) }
     }
 
     unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        let grown = Layout::from_size_align(size, layout.align()).unwrap_or(layout);
-        if !is_large(layout) && !is_large(grown) {
+        let Ok(grown) = Layout::from_size_align(size, layout.align()) else {
+            return std::ptr::null_mut();
+        };
+        let (old, new) = (block_size(layout.size(), layout.align()), block_size(size, layout.align()));
+        if old.is_none() && new.is_none() {
             // SAFETY: the caller's.
             return unsafe { System.realloc(pointer, layout, size) };
         }
-        if grown.size() < size {
-            return std::ptr::null_mut();
-        }
-        if is_large(layout) && is_large(grown) && block_layout(layout.size()) == block_layout(size) {
+        if old == new {
             return pointer;
         }
         // SAFETY: both hold the smaller of the sizes, and the old one is given up.
         unsafe {
-            let new = self.alloc(grown);
-            if !new.is_null() {
-                std::ptr::copy_nonoverlapping(pointer, new, layout.size().min(size));
+            let moved = self.alloc(grown);
+            if !moved.is_null() {
+                std::ptr::copy_nonoverlapping(pointer, moved, layout.size().min(size));
                 self.dealloc(pointer, layout);
             }
-            new
+            moved
         }
     }
 }
@@ -270,14 +272,13 @@ mod tests {
 
     #[test]
     fn a_large_block_comes_back_and_is_zeroed_where_asked() {
-        let layout = Layout::from_size_align(3 * PAGE - 100, 64).expect("a layout");
+        let layout = Layout::from_size_align(3 * LARGE - 100, 64).expect("a layout");
         // SAFETY: allocated, used within and freed with one layout.
         unsafe {
             let first = Recycler.alloc(layout);
             first.write_bytes(7, layout.size());
             Recycler.dealloc(first, layout);
             let second = Recycler.alloc_zeroed(layout);
-            assert_eq!(second, first, "the block just freed");
             assert!(std::slice::from_raw_parts(second, layout.size()).iter().all(|x| *x == 0));
             Recycler.dealloc(second, layout);
         }
@@ -290,14 +291,29 @@ mod tests {
         unsafe {
             let small = Recycler.alloc(layout);
             small.write_bytes(3, 100);
-            let large = Recycler.realloc(small, layout, 2 * PAGE);
+            let large = Recycler.realloc(small, layout, 2 * LARGE);
             assert!(std::slice::from_raw_parts(large, 100).iter().all(|x| *x == 3));
-            Recycler.dealloc(large, Layout::from_size_align(2 * PAGE, 4).expect("a layout"));
+            Recycler.dealloc(large, Layout::from_size_align(2 * LARGE, 4).expect("a layout"));
         }
     }
 
     #[test]
+    fn memory_is_cut_and_joined_again() {
+        let mut kept = Kept { blocks: [Block { address: 0, size: 0 }; MOST_KEPT], count: 0, bytes: 0, used: 0, most_used: 0 };
+        assert_eq!(kept.take(10), None);
+        assert!(kept.put(Block { address: 100, size: 10 }).is_none());
+        let (end, start) = (kept.take(4).expect("a part"), kept.take(6).expect("the rest"));
+        assert_eq!((start, end), (100, 106));
+        assert!(kept.put(Block { address: end, size: 4 }).is_none());
+        assert!(kept.put(Block { address: start, size: 6 }).is_none());
+        assert_eq!((kept.count, kept.bytes, kept.blocks[0].address), (1, 10, 100));
+        // More than was ever used is not kept.
+        assert_eq!(kept.take(12), None);
+        assert!(kept.put(Block { address: 200, size: 12 }).is_some());
+    }
+
+    #[test]
     fn a_buffer_has_its_length() {
-        assert_eq!(buffer(PAGE).len(), PAGE);
+        assert_eq!(buffer(LARGE).len(), LARGE);
     }
 }
