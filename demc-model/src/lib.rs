@@ -15,6 +15,7 @@ pub mod decoder;
 pub mod denoiser;
 pub mod encoder;
 pub mod fusion;
+pub mod inference;
 pub mod init;
 pub mod layers;
 pub mod metrics;
