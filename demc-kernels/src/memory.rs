@@ -84,13 +84,9 @@ impl Kept {
         Some(block.address + block.size - size)
     }
 
-    /// Takes memory back, joined with its neighbours; what is to go to the system, if anything.
+    /// Takes memory back, joined with its neighbours; the memory itself where there is no room for one more block.
     fn put(&mut self, mut block: Block) -> Option<Block> {
         self.used -= block.size;
-        // The process never holds more than it once used: what a phase of a run leaves behind goes back.
-        if self.used + self.bytes + block.size > self.most_used {
-            return Some(block);
-        }
         for index in (0..self.count).rev() {
             let other = self.blocks[index];
             let (below, above) = (other.address + other.size == block.address, block.address + block.size == other.address);
@@ -104,6 +100,14 @@ impl Kept {
         }
         self.insert(block);
         None
+    }
+
+    /// A block to give back to the system: the smallest one, while more is held than the process once used. So what a
+    /// phase of a run leaves behind goes back, and splinters go first.
+    fn surplus(&mut self) -> Option<Block> {
+        let too_much = self.used + self.bytes > self.most_used;
+        let smallest = (0..self.count).min_by_key(|i| self.blocks[*i].size);
+        smallest.filter(|_| too_much).map(|i| self.remove(i))
     }
 }
 
@@ -130,10 +134,11 @@ fn block(size: usize) -> (*mut u8, bool) {
 /// # Safety
 /// It came from [`block`], of this size, and nobody uses it any more.
 unsafe fn release(pointer: *mut u8, size: usize) {
-    let surplus = kept().put(Block { address: pointer.expose_provenance(), size });
-    if let Some(Block { address, size }) = surplus {
+    let mut surplus = kept().put(Block { address: pointer.expose_provenance(), size });
+    while let Some(Block { address, size }) = surplus.or_else(|| kept().surplus()) {
         // SAFETY: the caller's; joined blocks are whole pages that were mapped, and nobody's.
         unsafe { system::unmap(std::ptr::with_exposed_provenance_mut(address), size) };
+        surplus = None;
     }
 }
 
@@ -309,7 +314,9 @@ mod tests {
         assert_eq!((kept.count, kept.bytes, kept.blocks[0].address), (1, 10, 100));
         // More than was ever used is not kept.
         assert_eq!(kept.take(12), None);
-        assert!(kept.put(Block { address: 200, size: 12 }).is_some());
+        assert!(kept.put(Block { address: 200, size: 12 }).is_none());
+        assert_eq!(kept.surplus().map(|block| block.address), Some(100), "the smaller one");
+        assert!(kept.surplus().is_none());
     }
 
     #[test]
