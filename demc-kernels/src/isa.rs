@@ -49,7 +49,7 @@ impl Isa {
     }
 
     /// Whether this machine has it.
-    fn is_available(self) -> bool {
+    pub(crate) fn is_available(self) -> bool {
         // Miri runs no vendor instructions.
         if cfg!(miri) {
             return self == Isa::Portable;

@@ -33,12 +33,8 @@ pub(crate) unsafe trait Simd: Copy + Send + Sync + 'static {
     unsafe fn add(a: Self::V, b: Self::V) -> Self::V;
     unsafe fn sub(a: Self::V, b: Self::V) -> Self::V;
     unsafe fn mul(a: Self::V, b: Self::V) -> Self::V;
-    unsafe fn div(a: Self::V, b: Self::V) -> Self::V;
     /// `a * b + c` with one rounding (two on a path without fused multiply-add).
     unsafe fn fma(a: Self::V, b: Self::V, c: Self::V) -> Self::V;
-    /// The greater; `b` where one of them is NaN.
-    unsafe fn max(a: Self::V, b: Self::V) -> Self::V;
-    unsafe fn sqrt(a: Self::V) -> Self::V;
     /// `v` in the lanes where `gate` is positive, 0 elsewhere.
     unsafe fn gate(v: Self::V, gate: Self::V) -> Self::V;
     /// `yes` in the lanes where `a > b`, `no` elsewhere.
@@ -71,11 +67,14 @@ pub(crate) trait Leaf {
 /// Runs `leaf` on `isa`.
 ///
 /// # Safety
-/// What the leaf needs. An [`Isa`] that the machine does not have cannot be obtained but by naming it; that is checked.
+/// What the leaf needs.
+///
+/// # Panics
+/// Where the machine does not have `isa`.
 #[inline]
 pub(crate) unsafe fn run<L: Leaf>(isa: Isa, leaf: L) -> L::Out {
-    debug_assert!(Isa::available().contains(&isa), "{isa} is not on this machine");
-    // SAFETY: `available` was checked where the Isa was made current or parsed; a bare variant is checked in debug.
+    assert!(isa.is_available(), "{isa} is not on this machine");
+    // SAFETY: just checked; the rest is the caller's.
     unsafe {
         match isa {
             #[cfg(target_arch = "x86_64")]
@@ -146,10 +145,7 @@ mod x86 {
             fn add(a: __m512, b: __m512) -> __m512 { _mm512_add_ps(a, b) }
             fn sub(a: __m512, b: __m512) -> __m512 { _mm512_sub_ps(a, b) }
             fn mul(a: __m512, b: __m512) -> __m512 { _mm512_mul_ps(a, b) }
-            fn div(a: __m512, b: __m512) -> __m512 { _mm512_div_ps(a, b) }
             fn fma(a: __m512, b: __m512, c: __m512) -> __m512 { _mm512_fmadd_ps(a, b, c) }
-            fn max(a: __m512, b: __m512) -> __m512 { _mm512_max_ps(a, b) }
-            fn sqrt(a: __m512) -> __m512 { _mm512_sqrt_ps(a) }
             fn gate(v: __m512, gate: __m512) -> __m512 {
                 _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(gate, _mm512_setzero_ps()), v)
             }
@@ -192,10 +188,7 @@ mod x86 {
             fn add(a: __m256, b: __m256) -> __m256 { _mm256_add_ps(a, b) }
             fn sub(a: __m256, b: __m256) -> __m256 { _mm256_sub_ps(a, b) }
             fn mul(a: __m256, b: __m256) -> __m256 { _mm256_mul_ps(a, b) }
-            fn div(a: __m256, b: __m256) -> __m256 { _mm256_div_ps(a, b) }
             fn fma(a: __m256, b: __m256, c: __m256) -> __m256 { _mm256_fmadd_ps(a, b, c) }
-            fn max(a: __m256, b: __m256) -> __m256 { _mm256_max_ps(a, b) }
-            fn sqrt(a: __m256) -> __m256 { _mm256_sqrt_ps(a) }
             fn gate(v: __m256, gate: __m256) -> __m256 {
                 _mm256_and_ps(v, _mm256_cmp_ps::<_CMP_GT_OQ>(gate, _mm256_setzero_ps()))
             }
@@ -253,10 +246,7 @@ mod neon {
             fn add(a: float32x4_t, b: float32x4_t) -> float32x4_t { vaddq_f32(a, b) }
             fn sub(a: float32x4_t, b: float32x4_t) -> float32x4_t { vsubq_f32(a, b) }
             fn mul(a: float32x4_t, b: float32x4_t) -> float32x4_t { vmulq_f32(a, b) }
-            fn div(a: float32x4_t, b: float32x4_t) -> float32x4_t { vdivq_f32(a, b) }
             fn fma(a: float32x4_t, b: float32x4_t, c: float32x4_t) -> float32x4_t { vfmaq_f32(c, a, b) }
-            fn max(a: float32x4_t, b: float32x4_t) -> float32x4_t { vbslq_f32(vcgtq_f32(a, b), a, b) }
-            fn sqrt(a: float32x4_t) -> float32x4_t { vsqrtq_f32(a) }
             fn gate(v: float32x4_t, gate: float32x4_t) -> float32x4_t {
                 vbslq_f32(vcgtzq_f32(gate), v, vdupq_n_f32(0.0))
             }
@@ -305,12 +295,9 @@ mod portable {
             fn add(a: [f32; 4], b: [f32; 4]) -> [f32; 4] { zip(a, b, |a, b| a + b) }
             fn sub(a: [f32; 4], b: [f32; 4]) -> [f32; 4] { zip(a, b, |a, b| a - b) }
             fn mul(a: [f32; 4], b: [f32; 4]) -> [f32; 4] { zip(a, b, |a, b| a * b) }
-            fn div(a: [f32; 4], b: [f32; 4]) -> [f32; 4] { zip(a, b, |a, b| a / b) }
             fn fma(a: [f32; 4], b: [f32; 4], c: [f32; 4]) -> [f32; 4] {
                 std::array::from_fn(|i| a[i] * b[i] + c[i])
             }
-            fn max(a: [f32; 4], b: [f32; 4]) -> [f32; 4] { zip(a, b, |a, b| if a > b { a } else { b }) }
-            fn sqrt(a: [f32; 4]) -> [f32; 4] { a.map(f32::sqrt) }
             fn gate(v: [f32; 4], gate: [f32; 4]) -> [f32; 4] { zip(v, gate, |v, g| if g > 0.0 { v } else { 0.0 }) }
             fn greater(a: [f32; 4], b: [f32; 4], yes: [f32; 4], no: [f32; 4]) -> [f32; 4] {
                 std::array::from_fn(|i| if a[i] > b[i] { yes[i] } else { no[i] })
