@@ -59,20 +59,69 @@ pub fn forward_with(
     relu: bool,
     y: &mut [f32],
 ) {
-    let (inputs, outputs) = check(grid, x.len(), weight.len(), bias.len(), y.len());
-    let finish = Finish { bias: Some(bias), relu };
-    if !is_wide(inputs, outputs) {
-        let axes = thin::Axes::new(outputs, inputs, false);
-        return thin::convolve(isa, grid, x, None, weight, axes, finish, y);
+    check(grid, x.len(), weight.len(), bias.len(), y.len());
+    Ready::new(isa, tile, weight, bias, relu).forward(grid, x, 0, y);
+}
+
+/// A convolution whose weights are prepared once, for maps that come in bands of rows.
+pub struct Ready<'a> {
+    isa: Isa,
+    weights: Weights<'a>,
+    finish: Finish<'a>,
+    inputs: usize,
+    outputs: usize,
+}
+
+/// As the kernel of their channels takes them.
+enum Weights<'a> {
+    Thin(&'a [f32]),
+    F2(winograd::Weights),
+    F4(winograd::Weights),
+}
+
+impl<'a> Ready<'a> {
+    /// Of `weight` `[out, in, 3, 3]` and `bias` `[out]`, rectified where `relu`.
+    ///
+    /// # Panics
+    /// Where the lengths do not fit.
+    pub fn new(isa: Isa, tile: Tile, weight: &'a [f32], bias: &'a [f32], relu: bool) -> Self {
+        let outputs = bias.len();
+        let inputs = weight.len() / (9 * outputs);
+        assert_eq!(weight.len(), outputs * inputs * 9, "a weight of {inputs} to {outputs} channels");
+        let weights = match tile {
+            _ if !is_wide(inputs, outputs) => Weights::Thin(weight),
+            Tile::F2 => Weights::F2(winograd::Weights::new::<4>(isa, weight, outputs, inputs, false)),
+            Tile::F4 => Weights::F4(winograd::Weights::new::<6>(isa, weight, outputs, inputs, false)),
+        };
+        let finish = Finish { bias: Some(bias), relu };
+        Ready { isa, weights, finish, inputs, outputs }
     }
-    match tile {
-        Tile::F2 => {
-            let weights = winograd::Weights::new::<4>(isa, weight, outputs, inputs, false);
-            winograd::convolve::<4>(grid, x, None, &weights, finish, y);
-        }
-        Tile::F4 => {
-            let weights = winograd::Weights::new::<6>(isa, weight, outputs, inputs, false);
-            winograd::convolve::<6>(grid, x, None, &weights, finish, y);
+
+    /// Output channels.
+    pub fn outputs(&self) -> usize {
+        self.outputs
+    }
+
+    /// Convolves the rows of `x` from `above` on, as many as `y` has. Beyond the rows of `x` are zeros: where an image
+    /// goes on there, `x` holds a row more than `y` on that side. The same bits as of a whole image where a band begins at
+    /// a multiple of 4 rows and has one, or ends with the image.
+    ///
+    /// # Shapes
+    /// `x` `[B, H, W, in]` with its `grid`, `y` `[B, rows, W, out]`; several images only where `y` has all rows.
+    ///
+    /// # Panics
+    /// Where the lengths do not fit.
+    pub fn forward(&self, grid: Grid, x: &[f32], above: usize, y: &mut [f32]) {
+        assert_eq!(x.len(), grid.pixels() * self.inputs, "a map of {} channels on {grid:?}", self.inputs);
+        let row = grid.batch * grid.width * self.outputs;
+        assert!(y.len().is_multiple_of(row), "an output of {} channels on {grid:?}", self.outputs);
+        match &self.weights {
+            Weights::Thin(weight) => {
+                let axes = thin::Axes::new(self.outputs, self.inputs, false);
+                thin::convolve(self.isa, grid, x, None, above, weight, axes, self.finish, y);
+            }
+            Weights::F2(weights) => winograd::convolve_rows::<4>(grid, x, None, above, weights, self.finish, y),
+            Weights::F4(weights) => winograd::convolve_rows::<6>(grid, x, None, above, weights, self.finish, y),
         }
     }
 }
@@ -111,7 +160,7 @@ pub fn backward(
     } else {
         if let Some(dx) = dx {
             let axes = thin::Axes::new(outputs, inputs, true);
-            thin::convolve(isa, grid, dy, y, weight, axes, nothing, dx);
+            thin::convolve(isa, grid, dy, y, 0, weight, axes, nothing, dx);
         }
         thin::gradient(isa, grid, x, dy, y, dweight, dbias);
     }
@@ -161,6 +210,33 @@ mod tests {
                         assert_close(&format!("{name} dweight"), &dweight, &expected.dweight);
                         assert_close(&format!("{name} dbias"), &dbias, &expected.dbias);
                     }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn bands_of_rows_are_the_whole() {
+        let grid = Grid { batch: 1, height: 23, width: 9 };
+        for isa in Isa::available() {
+            for (inputs, outputs) in [(3, 20), (20, 3), (18, 33)] {
+                let (x, weight) = (pattern(grid.pixels() * inputs, 1), pattern(outputs * inputs * 9, 2));
+                let bias = pattern(outputs, 3);
+                for tile in [Tile::F2, Tile::F4] {
+                    let mut whole = vec![f32::NAN; grid.pixels() * outputs];
+                    forward_with(isa, tile, grid, &x, &weight, &bias, true, &mut whole);
+                    let ready = Ready::new(isa, tile, &weight, &bias, true);
+                    let mut bands = vec![f32::NAN; whole.len()];
+                    for (first, end) in [(0, 4), (4, 16), (16, 23)] {
+                        let (from, to) = (usize::saturating_sub(first, 1), (end + 1).min(grid.height));
+                        let row = grid.width * inputs;
+                        let y = &mut bands[first * grid.width * outputs..end * grid.width * outputs];
+                        let band = Grid { height: to - from, ..grid };
+                        ready.forward(band, &x[from * row..to * row], first - from, y);
+                    }
+                    let differs = |i: &usize| bands[*i].to_bits() != whole[*i].to_bits();
+                    let at = (0..whole.len()).find(differs).map(|i| (i / outputs, bands[i], whole[i]));
+                    assert!(at.is_none(), "{isa} {inputs} to {outputs} {tile:?}: pixel, found, expected: {at:?}");
                 }
             }
         }

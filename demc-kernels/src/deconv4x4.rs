@@ -135,8 +135,9 @@ impl Leaf for Pack<'_> {
             true => (4 * outputs, inputs, inputs),
         };
         let panels = Panels::new::<S>(columns);
-        for index in self.range {
-            for first in (0..lanes_of).step_by(S::LANES) {
+        // Outputs side by side in the file are taken side by side: a cache line each.
+        for first in (0..lanes_of).step_by(S::LANES) {
+            for index in self.range.clone() {
                 let count = S::LANES.min(lanes_of - first);
                 let mut taps = [[0.0; WIDEST]; 16];
                 for lane in 0..count {
@@ -202,52 +203,102 @@ pub fn forward(
     relu: bool,
     y: &mut [f32],
 ) {
-    let (inputs, outputs) = check(grid, x.len(), weight.len(), bias.len(), y.len());
-    let cells = Cells::new(grid);
-    let weights = packed(isa, weight, inputs, outputs, false);
-    let padded = cells.inputs(isa, x, inputs);
-    let wide = whole(4 * outputs);
-    let step = rows::block_rows(cells.count());
-    let shared = Shared::new(y);
-    (0..cells.count().div_ceil(step)).into_par_iter().for_each(|task| {
-        let first = task * step;
-        let count = step.min(cells.count() - first);
-        let terms: [Term; 4] = std::array::from_fn(|t| Term {
-            rows: &padded[(cells.offset(TAPS[t]) + first) * inputs..],
-            step: inputs,
-            weight: &weights[t],
-        });
-        let mut c = Scratch::take(padded_rows(count) * wide);
-        rows::sum(isa, count, &terms, &mut c, wide);
-        // The cells of a row lie side by side in two rows of the output.
-        let mut cell = first;
-        while cell < first + count {
-            let (line, column) = (cell / cells.across, cell % cells.across);
-            let (image, row) = (line / (grid.height + 1), line % (grid.height + 1));
-            let run = (cells.across - column).min(first + count - cell);
-            for phase in 0..4 {
-                let (py, px) = (phase / 2, phase % 2);
-                let Some(y_row) = (2 * row + py).checked_sub(1).filter(|y| *y < 2 * grid.height) else { continue };
-                // Cells whose pixel 2 * column + px - 1 exists.
-                let skipped = usize::from(2 * column + px == 0);
-                let past = usize::from(2 * (column + run - 1) + px > 2 * grid.width);
-                if skipped + past >= run {
-                    continue;
+    check(grid, x.len(), weight.len(), bias.len(), y.len());
+    Ready::new(isa, weight, bias, relu).forward(grid, x, 0, y);
+}
+
+/// A deconvolution whose weights are prepared once, for maps that come in bands of rows.
+pub struct Ready<'a> {
+    isa: Isa,
+    weights: [Packed; 4],
+    bias: &'a [f32],
+    relu: bool,
+    inputs: usize,
+}
+
+impl<'a> Ready<'a> {
+    /// Of `weight` `[in, out, 4, 4]` and `bias` `[out]`, rectified where `relu`.
+    ///
+    /// # Panics
+    /// Where the lengths do not fit.
+    pub fn new(isa: Isa, weight: &[f32], bias: &'a [f32], relu: bool) -> Self {
+        let outputs = bias.len();
+        let inputs = weight.len() / (16 * outputs);
+        assert_eq!(weight.len(), inputs * outputs * 16, "a weight of {inputs} to {outputs} channels");
+        let weights = packed(isa, weight, inputs, outputs, false);
+        Ready { isa, weights, bias, relu, inputs }
+    }
+
+    /// Output channels.
+    pub fn outputs(&self) -> usize {
+        self.bias.len()
+    }
+
+    /// Makes of the rows of `x` from `above` on as many as `y` has, twice as many as they are. Beyond the rows of `x` are
+    /// zeros: where an image goes on there, `x` holds a row more on that side.
+    ///
+    /// # Shapes
+    /// `x` `[B, H, W, in]` with its `grid`, `y` `[B, 2 rows, 2W, out]`; several images only where `y` has all rows.
+    ///
+    /// # Panics
+    /// Where the lengths do not fit.
+    pub fn forward(&self, grid: Grid, x: &[f32], above: usize, y: &mut [f32]) {
+        let Ready { isa, weights, bias, relu, inputs } = self;
+        let (isa, relu, inputs, outputs) = (*isa, *relu, *inputs, bias.len());
+        let row = grid.batch * 2 * grid.width * outputs;
+        let height = y.len() / row;
+        assert_eq!(x.len(), grid.pixels() * inputs, "a map of {inputs} channels on {grid:?}");
+        assert!(y.len() == height * row && height % 2 == 0, "an output of {outputs} channels on twice {grid:?}");
+        assert!(above + height / 2 <= grid.height, "rows {above} to {} of {grid:?}", above + height / 2);
+        assert!(grid.batch == 1 || height == 2 * grid.height, "a band of a single image");
+        let cells = Cells::new(grid);
+        // Those of the asked rows: a line of cells gives a row to the one above and a row to the one below.
+        let skipped = above * cells.across;
+        let cell_count = if grid.batch == 1 { (height / 2 + 1) * cells.across } else { cells.count() };
+        let padded = cells.inputs(isa, x, inputs);
+        let wide = whole(4 * outputs);
+        let step = rows::block_rows(cell_count);
+        let shared = Shared::new(y);
+        (0..cell_count.div_ceil(step)).into_par_iter().for_each(|task| {
+            let count = step.min(cell_count - task * step);
+            let first = skipped + task * step;
+            let terms: [Term; 4] = std::array::from_fn(|t| Term {
+                rows: &padded[(cells.offset(TAPS[t]) + first) * inputs..],
+                step: inputs,
+                weight: &weights[t],
+            });
+            let mut c = Scratch::take(padded_rows(count) * wide);
+            rows::sum(isa, count, &terms, &mut c, wide);
+            // The cells of a row lie side by side in two rows of the output.
+            let mut cell = first;
+            while cell < first + count {
+                let (line, column) = (cell / cells.across, cell % cells.across);
+                let (image, row) = (line / (grid.height + 1), line % (grid.height + 1));
+                let run = (cells.across - column).min(first + count - cell);
+                for phase in 0..4 {
+                    let (py, px) = (phase / 2, phase % 2);
+                    let Some(y_row) = (2 * row + py).checked_sub(1 + 2 * above).filter(|y| *y < height) else { continue };
+                    // Cells whose pixel 2 * column + px - 1 exists.
+                    let skipped = usize::from(2 * column + px == 0);
+                    let past = usize::from(2 * (column + run - 1) + px > 2 * grid.width);
+                    if skipped + past >= run {
+                        continue;
+                    }
+                    let rows = run - skipped - past;
+                    let pixel = (image * height + y_row) * 2 * grid.width + 2 * (column + skipped) + px - 1;
+                    let len = ((rows - 1) * 2 + 1) * outputs;
+                    // SAFETY: tasks write the pixels of different cells, and a phase is one pixel of a cell; the slice spans
+                    // pixels of other phases too, which nobody but this task's own loop writes meanwhile.
+                    let to = unsafe { std::slice::from_raw_parts_mut(shared.pointer().add(pixel * outputs), len) };
+                    copy(isa, Copy {
+                        from: &c[(cell - first + skipped) * wide + phase * outputs..], from_step: wide, gate: None,
+                        bias: Some(bias), relu, to, to_step: 2 * outputs, rows, channels: outputs,
+                    });
                 }
-                let rows = run - skipped - past;
-                let pixel = (image * 2 * grid.height + y_row) * 2 * grid.width + 2 * (column + skipped) + px - 1;
-                let len = ((rows - 1) * 2 + 1) * outputs;
-                // SAFETY: tasks write the pixels of different cells, and a phase is one pixel of a cell; the slice spans
-                // pixels of other phases too, which nobody but this task's own loop writes meanwhile.
-                let to = unsafe { std::slice::from_raw_parts_mut(shared.pointer().add(pixel * outputs), len) };
-                copy(isa, Copy {
-                    from: &c[(cell - first + skipped) * wide + phase * outputs..], from_step: wide, gate: None,
-                    bias: Some(bias), relu, to, to_step: 2 * outputs, rows, channels: outputs,
-                });
+                cell += run;
             }
-            cell += run;
-        }
-    });
+        });
+    }
 }
 
 /// Gradients of [`forward`] for `dy`, the gradient by `y`: `dx` where asked for, `dweight`, `dbias`, all overwritten.
@@ -353,6 +404,27 @@ mod tests {
     use super::*;
     use crate::reference;
     use crate::testing::{assert_close, f64s, grids, pattern};
+
+    #[test]
+    fn bands_of_rows_are_the_whole() {
+        let grid = Grid { batch: 1, height: 11, width: 9 };
+        let (inputs, outputs) = (18, 7);
+        for isa in Isa::available() {
+            let (x, weight) = (pattern(grid.pixels() * inputs, 1), pattern(outputs * inputs * 16, 2));
+            let bias = pattern(outputs, 3);
+            let mut whole = vec![f32::NAN; grid.doubled().pixels() * outputs];
+            forward(isa, grid, &x, &weight, &bias, true, &mut whole);
+            let ready = Ready::new(isa, &weight, &bias, true);
+            let mut bands = vec![f32::NAN; whole.len()];
+            for (first, end) in [(0, 1), (1, 7), (7, 11)] {
+                let (from, to) = (usize::saturating_sub(first, 1), (end + 1).min(grid.height));
+                let (row, y_row) = (grid.width * inputs, 4 * grid.width * outputs);
+                let band = Grid { height: to - from, ..grid };
+                ready.forward(band, &x[from * row..to * row], first - from, &mut bands[first * y_row..end * y_row]);
+            }
+            assert!(bands == whole, "{isa}");
+        }
+    }
 
     #[test]
     fn equals_the_reference_on_every_path_at_odd_sizes() {

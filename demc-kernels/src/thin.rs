@@ -150,28 +150,46 @@ impl Source<'_> {
     }
 }
 
-/// `y = finish(weight * x)`, `x` gated where a gate is given.
+/// `y = finish(weight * x)`, `x` gated where a gate is given, of the rows from `above` on, as many as `y` has; `grid` is
+/// that of `x`.
+///
+/// # Panics
+/// Where there are several images and `y` does not have all their rows.
 #[allow(clippy::too_many_arguments, reason = "what a convolution is made of")]
 pub(crate) fn convolve(
     isa: Isa,
     grid: Grid,
     x: &[f32],
     gate: Option<&[f32]>,
+    above: usize,
     weight: &[f32],
     axes: Axes,
     finish: Finish,
     y: &mut [f32],
 ) {
     let source = Source { map: x, gate, channels: axes.inputs };
+    let height = y.len() / (grid.batch * grid.width * axes.outputs);
+    assert!(above + height <= grid.height, "rows {above} to {} of {grid:?}", above + height);
+    assert!(grid.batch == 1 || height == grid.height, "a band of a single image");
     if 9 * axes.outputs <= MOST_COLLECTED && axes.inputs > axes.outputs {
-        collect(isa, grid, source, weight, axes, finish, y);
+        collect(isa, grid, source, above, weight, axes, finish, y);
     } else {
-        spread(isa, grid, source, weight, axes, finish, y);
+        spread(isa, grid, source, above, weight, axes, finish, y);
     }
 }
 
 /// By rows of neighbourhoods.
-fn spread(isa: Isa, grid: Grid, source: Source, weight: &[f32], axes: Axes, finish: Finish, y: &mut [f32]) {
+#[allow(clippy::too_many_arguments, reason = "as `convolve`")]
+fn spread(
+    isa: Isa,
+    grid: Grid,
+    source: Source,
+    above: usize,
+    weight: &[f32],
+    axes: Axes,
+    finish: Finish,
+    y: &mut [f32],
+) {
     let (depth, columns) = (9 * axes.inputs, axes.outputs);
     let b = Packed::new(isa, depth, columns, |k, column| {
         weight[axes.place(k % axes.inputs, column, k / axes.inputs)]
@@ -181,7 +199,8 @@ fn spread(isa: Isa, grid: Grid, source: Source, weight: &[f32], axes: Axes, fini
         let (first, count) = (task * BLOCK, y.len() / columns);
         let mut a = Scratch::take(padded_rows(count) * depth);
         let mut c = Scratch::take(padded_rows(count) * wide);
-        source.gather(isa, grid, first..first + count, false, &mut a, depth);
+        let skipped = above * grid.width;
+        source.gather(isa, grid, skipped + first..skipped + first + count, false, &mut a, depth);
         rows::sum(isa, count, &[Term { rows: &a, step: depth, weight: &b }], &mut c, wide);
         copy(isa, Copy {
             from: &c, from_step: wide, gate: None, bias: finish.bias, relu: finish.relu,
@@ -191,7 +210,17 @@ fn spread(isa: Isa, grid: Grid, source: Source, weight: &[f32], axes: Axes, fini
 }
 
 /// By the values that a pixel gives to its neighbours.
-fn collect(isa: Isa, grid: Grid, source: Source, weight: &[f32], axes: Axes, finish: Finish, y: &mut [f32]) {
+#[allow(clippy::too_many_arguments, reason = "as `convolve`")]
+fn collect(
+    isa: Isa,
+    grid: Grid,
+    source: Source,
+    above: usize,
+    weight: &[f32],
+    axes: Axes,
+    finish: Finish,
+    y: &mut [f32],
+) {
     let (depth, outputs) = (axes.inputs, axes.outputs);
     let columns = 9 * outputs;
     let b = Packed::new(isa, depth, columns, |k, column| {
@@ -201,7 +230,8 @@ fn collect(isa: Isa, grid: Grid, source: Source, weight: &[f32], axes: Axes, fin
     let image = grid.height * grid.width;
     // An image at a time, so that what is collected is still in a cache.
     let mut given = Scratch::take((image.next_multiple_of(BLOCK) + BLOCK) * wide);
-    for (index, y) in y.chunks_mut(image * outputs).enumerate() {
+    let rows = y.len() / grid.batch;
+    for (index, y) in y.chunks_mut(rows).enumerate() {
         given.par_chunks_mut(BLOCK * wide).take(image.div_ceil(BLOCK)).enumerate().for_each(|(task, c)| {
             let first = task * BLOCK;
             let count = BLOCK.min(image - first);
@@ -210,7 +240,7 @@ fn collect(isa: Isa, grid: Grid, source: Source, weight: &[f32], axes: Axes, fin
             rows::sum(isa, count, &[Term { rows: &a, step: depth, weight: &b }], c, wide);
         });
         y.par_chunks_mut(grid.width * outputs).enumerate().for_each(|(row, y)| {
-            let leaf = Collect { grid, given: &given, wide, finish, row, outputs, y };
+            let leaf = Collect { grid, given: &given, wide, finish, row: above + row, outputs, y };
             // SAFETY: the leaf checks its lengths.
             unsafe { run(isa, leaf) }
         });

@@ -184,7 +184,12 @@ macro_rules! both {
 /// The tiles that cover a grid.
 #[derive(Clone, Copy)]
 struct Tiles {
+    /// Of the output.
     grid: Grid,
+    /// Of the input: more rows where the output is a band of an image.
+    input: Grid,
+    /// Rows of the input above the output's first.
+    above: usize,
     out: usize,
     down: usize,
     across: usize,
@@ -192,8 +197,14 @@ struct Tiles {
 
 impl Tiles {
     fn new(grid: Grid, out: usize) -> Self {
-        let (down, across) = (grid.height.div_ceil(out), grid.width.div_ceil(out));
-        Tiles { grid, out, down, across }
+        Tiles::of_rows(grid, 0, grid.height, out)
+    }
+
+    /// Those of `height` rows from `above` on.
+    fn of_rows(input: Grid, above: usize, height: usize, out: usize) -> Self {
+        let grid = Grid { height, ..input };
+        let (down, across) = (height.div_ceil(out), grid.width.div_ceil(out));
+        Tiles { grid, input, above, out, down, across }
     }
 
     fn count(self) -> usize {
@@ -205,6 +216,14 @@ impl Tiles {
         let (image, rest) = (tile / (self.down * self.across), tile % (self.down * self.across));
         let first = image * self.grid.height * self.grid.width;
         (first, rest / self.across * self.out, rest % self.across * self.out)
+    }
+
+    /// First pixel of the input's image, row and column there of a tile's input, which begins a row and a column before
+    /// its output.
+    fn input_at(self, tile: usize) -> (usize, isize, isize) {
+        let (_, row, column) = self.at(tile);
+        let first = tile / (self.down * self.across) * self.input.height * self.input.width;
+        (first, (row + self.above) as isize - 1, column as isize - 1)
     }
 }
 
@@ -458,12 +477,11 @@ unsafe fn take_input<S: Simd, const IN: usize>(
     to: Space,
 ) {
     for (index, tile) in range.enumerate() {
-        let (image, row, column) = tiles.at(tile);
+        let (image, row, column) = tiles.input_at(tile);
         for channel in (0..source.channels).step_by(S::LANES) {
             // SAFETY: the caller's.
             unsafe {
-                let (row, column) = (row as isize - 1, column as isize - 1);
-                let d = source.tile::<S, IN, IN>(tiles.grid, image, row, column, channel);
+                let d = source.tile::<S, IN, IN>(tiles.input, image, row, column, channel);
                 let v = both!(line::input::<S, IN>, S, IN, d);
                 to.store::<S, IN>(index, channel, v);
             }
@@ -592,12 +610,30 @@ pub(crate) fn convolve<const IN: usize>(
     finish: Finish,
     y: &mut [f32],
 ) {
+    convolve_rows::<IN>(grid, x, gate, 0, weights, finish, y);
+}
+
+/// The same of the rows from `above` on, as many as `y` has; `grid` is that of `x`.
+///
+/// # Panics
+/// Where a length is not that of its map, or `x` does not have those rows.
+pub(crate) fn convolve_rows<const IN: usize>(
+    grid: Grid,
+    x: &[f32],
+    gate: Option<&[f32]>,
+    above: usize,
+    weights: &Weights,
+    finish: Finish,
+    y: &mut [f32],
+) {
     let (depth, columns) = (weights.depth, weights.columns);
+    let height = y.len() / (grid.batch * grid.width * columns);
     assert_eq!(x.len(), grid.pixels() * depth, "a map of {depth} channels on {grid:?}");
-    assert_eq!(y.len(), grid.pixels() * columns, "a map of {columns} channels on {grid:?}");
+    assert_eq!(y.len(), grid.batch * height * grid.width * columns, "a map of {columns} channels on {grid:?}");
+    assert!(above + height <= grid.height, "rows {above} to {} of {grid:?}", above + height);
     assert!(gate.is_none_or(|gate| gate.len() == x.len()), "the gate of a map of {} values", x.len());
     let source = Source { map: x, gate, channels: depth };
-    let tiles = Tiles::new(grid, IN - 2);
+    let tiles = Tiles::of_rows(grid, above, height, IN - 2);
     let step = block_tiles(tiles.count(), IN * IN * (depth + columns), weights.values.len());
     let y = Shared::new(y);
     (0..tiles.count().div_ceil(step)).into_par_iter().for_each(|task| {
