@@ -2,8 +2,8 @@
 
 use rayon::prelude::*;
 
-use crate::rows::{self, BLOCK, Copy, Outer, Packed, Term, Window, copy, whole};
 use crate::product::padded_rows;
+use crate::rows::{self, BLOCK, Copy, Outer, Packed, Term, Window, copy, whole};
 use crate::scratch::Scratch;
 use crate::{Grid, Isa};
 
@@ -23,13 +23,29 @@ pub fn forward(
     relu: bool,
     y: &mut [f32],
 ) {
-    let (inputs, outputs) = (check(grid, xs, weight.len(), bias.len(), y.len()), bias.len());
+    let (inputs, outputs) = (
+        check(grid, xs, weight.len(), bias.len(), y.len()),
+        bias.len(),
+    );
     let total: usize = inputs.iter().map(|(_, count)| count).sum();
     let weights: Vec<Packed> = inputs
         .iter()
-        .map(|&(first, count)| Packed::new(isa, count, outputs, |k, o| weight[o * total + first + k]))
+        .map(|&(first, count)| {
+            Packed::new(isa, count, outputs, |k, o| weight[o * total + first + k])
+        })
         .collect();
-    products(isa, xs, &inputs, &weights, Finish { bias: Some(bias), relu, add: false }, y);
+    products(
+        isa,
+        xs,
+        &inputs,
+        &weights,
+        Finish {
+            bias: Some(bias),
+            relu,
+            add: false,
+        },
+        y,
+    );
 }
 
 /// What becomes of the sum of [`part`].
@@ -54,16 +70,34 @@ pub struct Finish<'a> {
 ///
 /// # Panics
 /// Where the lengths do not fit.
-pub fn part(isa: Isa, grid: Grid, xs: &[&[f32]], weight: &[f32], first: usize, finish: Finish, y: &mut [f32]) {
+pub fn part(
+    isa: Isa,
+    grid: Grid,
+    xs: &[&[f32]],
+    weight: &[f32],
+    first: usize,
+    finish: Finish,
+    y: &mut [f32],
+) {
     let outputs = grid.channels(y.len());
     let total = weight.len() / outputs;
     let inputs = widths(grid, xs);
     let end = first + inputs.iter().map(|(_, count)| count).sum::<usize>();
-    assert!(weight.len() == total * outputs && end <= total, "inputs {first} to {end} of {total}");
-    assert!(finish.bias.is_none_or(|bias| bias.len() == outputs), "a bias of {outputs} channels");
+    assert!(
+        weight.len() == total * outputs && end <= total,
+        "inputs {first} to {end} of {total}"
+    );
+    assert!(
+        finish.bias.is_none_or(|bias| bias.len() == outputs),
+        "a bias of {outputs} channels"
+    );
     let weights: Vec<Packed> = inputs
         .iter()
-        .map(|&(at, count)| Packed::new(isa, count, outputs, |k, o| weight[o * total + first + at + k]))
+        .map(|&(at, count)| {
+            Packed::new(isa, count, outputs, |k, o| {
+                weight[o * total + first + at + k]
+            })
+        })
         .collect();
     products(isa, xs, &inputs, &weights, finish, y);
 }
@@ -79,31 +113,60 @@ fn products(
 ) {
     let outputs = weights[0].columns();
     let wide = whole(outputs);
-    y.par_chunks_mut(BLOCK * outputs).enumerate().for_each(|(task, y)| {
-        let (first, count) = (task * BLOCK, y.len() / outputs);
-        let windows: Vec<Window> =
-            xs.iter().zip(inputs).map(|(x, (_, step))| Window::new(x, *step, first, count)).collect();
-        let terms: Vec<Term> = windows
-            .iter()
-            .zip(inputs)
-            .zip(weights)
-            .map(|((window, (_, step)), weight)| Term { rows: window.rows(), step: *step, weight })
-            .collect();
-        let mut c = Scratch::take(padded_rows(count) * wide);
-        if finish.add {
-            copy(isa, Copy {
-                from: y, from_step: outputs, gate: None, bias: None, relu: false,
-                to: &mut c, to_step: wide, rows: count, channels: outputs,
-            });
-            rows::add_sum(isa, count, &terms, &mut c, wide);
-        } else {
-            rows::sum(isa, count, &terms, &mut c, wide);
-        }
-        copy(isa, Copy {
-            from: &c, from_step: wide, gate: None, bias: finish.bias, relu: finish.relu,
-            to: y, to_step: outputs, rows: count, channels: outputs,
+    y.par_chunks_mut(BLOCK * outputs)
+        .enumerate()
+        .for_each(|(task, y)| {
+            let (first, count) = (task * BLOCK, y.len() / outputs);
+            let windows: Vec<Window> = xs
+                .iter()
+                .zip(inputs)
+                .map(|(x, (_, step))| Window::new(x, *step, first, count))
+                .collect();
+            let terms: Vec<Term> = windows
+                .iter()
+                .zip(inputs)
+                .zip(weights)
+                .map(|((window, (_, step)), weight)| Term {
+                    rows: window.rows(),
+                    step: *step,
+                    weight,
+                })
+                .collect();
+            let mut c = Scratch::take(padded_rows(count) * wide);
+            if finish.add {
+                copy(
+                    isa,
+                    Copy {
+                        from: y,
+                        from_step: outputs,
+                        gate: None,
+                        bias: None,
+                        relu: false,
+                        to: &mut c,
+                        to_step: wide,
+                        rows: count,
+                        channels: outputs,
+                    },
+                );
+                rows::add_sum(isa, count, &terms, &mut c, wide);
+            } else {
+                rows::sum(isa, count, &terms, &mut c, wide);
+            }
+            copy(
+                isa,
+                Copy {
+                    from: &c,
+                    from_step: wide,
+                    gate: None,
+                    bias: finish.bias,
+                    relu: finish.relu,
+                    to: y,
+                    to_step: outputs,
+                    rows: count,
+                    channels: outputs,
+                },
+            );
         });
-    });
 }
 
 /// Gradients of [`forward`] for `dy`, the gradient by `y`: those of `xs` where asked for, `dweight`, `dbias`, all
@@ -128,26 +191,48 @@ pub fn backward(
     dweight: &mut [f32],
     dbias: &mut [f32],
 ) {
-    let (inputs, outputs) = (check(grid, xs, weight.len(), dbias.len(), dy.len()), dbias.len());
+    let (inputs, outputs) = (
+        check(grid, xs, weight.len(), dbias.len(), dy.len()),
+        dbias.len(),
+    );
     assert_eq!(dweight.len(), weight.len(), "a weight's gradient");
-    assert!(y.is_none_or(|y| y.len() == dy.len()), "an output of {} values", dy.len());
+    assert!(
+        y.is_none_or(|y| y.len() == dy.len()),
+        "an output of {} values",
+        dy.len()
+    );
     assert_eq!(xs.len(), dxs.len(), "a gradient, or none, for each input");
-    let (total, pixels) = (inputs.iter().map(|(_, count)| count).sum::<usize>(), grid.pixels());
+    let (total, pixels) = (
+        inputs.iter().map(|(_, count)| count).sum::<usize>(),
+        grid.pixels(),
+    );
     let wide = whole(outputs);
 
     // The gated gradient with whole vectors in its rows, and its sums over blocks.
     let mut gated = Scratch::take(pixels * wide);
     let mut biases = vec![0.0f64; pixels.div_ceil(BLOCK) * outputs];
-    gated.par_chunks_mut(BLOCK * wide).zip(biases.par_chunks_mut(outputs)).enumerate().for_each(
-        |(task, (gated, sums))| {
+    gated
+        .par_chunks_mut(BLOCK * wide)
+        .zip(biases.par_chunks_mut(outputs))
+        .enumerate()
+        .for_each(|(task, (gated, sums))| {
             let (first, count) = (task * BLOCK * outputs, gated.len() / wide);
-            copy(isa, Copy {
-                from: &dy[first..], from_step: outputs, gate: y.map(|y| &y[first..]), bias: None, relu: false,
-                to: gated, to_step: wide, rows: count, channels: outputs,
-            });
-            rows::column_sums(gated, wide, count, outputs, sums);
-        },
-    );
+            copy(
+                isa,
+                Copy {
+                    from: &dy[first..],
+                    from_step: outputs,
+                    gate: y.map(|y| &y[first..]),
+                    bias: None,
+                    relu: false,
+                    to: gated,
+                    to_step: wide,
+                    rows: count,
+                    channels: outputs,
+                },
+            );
+            rows::column_sums(isa, gated, wide, count, outputs, sums);
+        });
     for (o, dbias) in dbias.iter_mut().enumerate() {
         *dbias = biases[o..].iter().step_by(outputs).sum::<f64>() as f32;
     }
@@ -156,39 +241,70 @@ pub fn backward(
         let Some(dx) = dx else { continue };
         assert_eq!(dx.len(), x.len(), "an input's gradient");
         let transposed = Packed::new(isa, outputs, count, |o, i| weight[o * total + first + i]);
-        dx.par_chunks_mut(BLOCK * count).enumerate().for_each(|(task, dx)| {
-            let rows = dx.len() / count;
-            let window = Window::new(&gated, wide, task * BLOCK, rows);
-            let c_step = whole(count);
-            let mut c = Scratch::take(padded_rows(rows) * c_step);
-            let term = Term { rows: window.rows(), step: wide, weight: &transposed };
-            rows::sum(isa, rows, &[term], &mut c, c_step);
-            copy(isa, Copy {
-                from: &c, from_step: c_step, gate: None, bias: None, relu: false,
-                to: dx, to_step: count, rows, channels: count,
+        dx.par_chunks_mut(BLOCK * count)
+            .enumerate()
+            .for_each(|(task, dx)| {
+                let rows = dx.len() / count;
+                let window = Window::new(&gated, wide, task * BLOCK, rows);
+                let c_step = whole(count);
+                let mut c = Scratch::take(padded_rows(rows) * c_step);
+                let term = Term {
+                    rows: window.rows(),
+                    step: wide,
+                    weight: &transposed,
+                };
+                rows::sum(isa, rows, &[term], &mut c, c_step);
+                copy(
+                    isa,
+                    Copy {
+                        from: &c,
+                        from_step: c_step,
+                        gate: None,
+                        bias: None,
+                        relu: false,
+                        to: dx,
+                        to_step: count,
+                        rows,
+                        channels: count,
+                    },
+                );
             });
-        });
     }
 
     for (x, &(first, count)) in xs.iter().zip(&inputs) {
         // Blocks of rows read past the last pixels: those apart, from a copy.
-        let outer = |a, b, pixels| Outer { a, a_step: count, rows: count, b, b_step: wide, columns: outputs, pixels };
+        let outer = |a, b, pixels| Outer {
+            a,
+            a_step: count,
+            rows: count,
+            b,
+            b_step: wide,
+            columns: outputs,
+            pixels,
+        };
         let mut products = Vec::with_capacity(2);
         if pixels > 1 + 24_usize.div_ceil(count) {
             let tail = 24_usize.div_ceil(count) + 1;
             let body = pixels - tail;
             products.push(rows::outer(isa, &[outer(x, &gated, body)], wide));
             let end = Window::new(x, count, body, tail);
-            products.push(rows::outer(isa, &[outer(end.rows(), &gated[body * wide..], tail)], wide));
+            products.push(rows::outer(
+                isa,
+                &[outer(end.rows(), &gated[body * wide..], tail)],
+                wide,
+            ));
         } else {
             let all = Window::new(x, count, 0, pixels);
             products.push(rows::outer(isa, &[outer(all.rows(), &gated, pixels)], wide));
         }
-        dweight.par_chunks_mut(total).enumerate().for_each(|(o, dweight)| {
-            for (i, dweight) in dweight[first..first + count].iter_mut().enumerate() {
-                *dweight = products.iter().map(|product| product[i * wide + o]).sum();
-            }
-        });
+        dweight
+            .par_chunks_mut(total)
+            .enumerate()
+            .for_each(|(o, dweight)| {
+                for (i, dweight) in dweight[first..first + count].iter_mut().enumerate() {
+                    *dweight = products.iter().map(|product| product[i * wide + o]).sum();
+                }
+            });
     }
 }
 
@@ -205,11 +321,25 @@ fn widths(grid: Grid, xs: &[&[f32]]) -> Vec<(usize, usize)> {
 }
 
 /// The same, once all lengths are known to fit.
-fn check(grid: Grid, xs: &[&[f32]], weight: usize, outputs: usize, y: usize) -> Vec<(usize, usize)> {
+fn check(
+    grid: Grid,
+    xs: &[&[f32]],
+    weight: usize,
+    outputs: usize,
+    y: usize,
+) -> Vec<(usize, usize)> {
     let inputs = widths(grid, xs);
     let first: usize = inputs.iter().map(|(_, count)| count).sum();
-    assert_eq!(y, grid.pixels() * outputs, "an output of {outputs} channels on {grid:?}");
-    assert_eq!(weight, outputs * first, "a weight of {first} to {outputs} channels");
+    assert_eq!(
+        y,
+        grid.pixels() * outputs,
+        "an output of {outputs} channels on {grid:?}"
+    );
+    assert_eq!(
+        weight,
+        outputs * first,
+        "a weight of {first} to {outputs} channels"
+    );
     inputs
 }
 
@@ -223,7 +353,9 @@ mod tests {
         let rows = (0..grid.pixels()).flat_map(|p| {
             xs.iter().flat_map(move |x| {
                 let channels = grid.channels(x.len());
-                x[p * channels..(p + 1) * channels].iter().map(|x| f64::from(*x))
+                x[p * channels..(p + 1) * channels]
+                    .iter()
+                    .map(|x| f64::from(*x))
             })
         });
         rows.collect()
@@ -234,16 +366,28 @@ mod tests {
         let (inputs, outputs) = ([20, 3, 16], 18);
         for isa in Isa::available() {
             for grid in grids() {
-                let maps: Vec<Vec<f32>> =
-                    inputs.iter().enumerate().map(|(s, c)| pattern(grid.pixels() * c, s as u32)).collect();
+                let maps: Vec<Vec<f32>> = inputs
+                    .iter()
+                    .enumerate()
+                    .map(|(s, c)| pattern(grid.pixels() * c, s as u32))
+                    .collect();
                 let xs: Vec<&[f32]> = maps.iter().map(|x| &x[..]).collect();
                 let (weight, bias) = (pattern(outputs * 39, 7), pattern(outputs, 8));
                 let mut y = vec![f32::NAN; grid.pixels() * outputs];
                 part(isa, grid, &xs[1..], &weight, 20, Finish::default(), &mut y);
-                let last = Finish { bias: Some(&bias), relu: true, add: true };
+                let last = Finish {
+                    bias: Some(&bias),
+                    relu: true,
+                    add: true,
+                };
                 part(isa, grid, &xs[..1], &weight, 0, last, &mut y);
-                let expected =
-                    reference::conv1x1(grid, &concatenated(grid, &xs), &f64s(&weight), &f64s(&bias), true);
+                let expected = reference::conv1x1(
+                    grid,
+                    &concatenated(grid, &xs),
+                    &f64s(&weight),
+                    &f64s(&bias),
+                    true,
+                );
                 assert_close(&format!("{isa} {grid:?}"), &y, &expected);
             }
         }
@@ -253,9 +397,17 @@ mod tests {
     fn equals_the_reference_of_the_concatenation_on_every_path() {
         for isa in Isa::available() {
             for grid in grids() {
-                for (inputs, outputs) in [(vec![6, 6, 6], 6), (vec![1], 1), (vec![33, 17], 40), (vec![64, 64, 64], 64)] {
-                    let maps: Vec<Vec<f32>> =
-                        inputs.iter().enumerate().map(|(s, c)| pattern(grid.pixels() * c, s as u32)).collect();
+                for (inputs, outputs) in [
+                    (vec![6, 6, 6], 6),
+                    (vec![1], 1),
+                    (vec![33, 17], 40),
+                    (vec![64, 64, 64], 64),
+                ] {
+                    let maps: Vec<Vec<f32>> = inputs
+                        .iter()
+                        .enumerate()
+                        .map(|(s, c)| pattern(grid.pixels() * c, s as u32))
+                        .collect();
                     let xs: Vec<&[f32]> = maps.iter().map(|x| &x[..]).collect();
                     let total: usize = inputs.iter().sum();
                     let (weight, bias) = (pattern(outputs * total, 7), pattern(outputs, 8));
@@ -264,18 +416,36 @@ mod tests {
                     let cat = concatenated(grid, &xs);
                     let mut y = vec![f32::NAN; dy.len()];
                     forward(isa, grid, &xs, &weight, &bias, true, &mut y);
-                    let expected = reference::conv1x1(grid, &cat, &f64s(&weight), &f64s(&bias), true);
+                    let expected =
+                        reference::conv1x1(grid, &cat, &f64s(&weight), &f64s(&bias), true);
                     assert_close(&format!("{name} y"), &y, &expected);
 
                     let expected = reference::conv1x1_backward(
-                        grid, &cat, &f64s(&weight), &reference::gated(&f64s(&dy), &f64s(&y)),
+                        grid,
+                        &cat,
+                        &f64s(&weight),
+                        &reference::gated(&f64s(&dy), &f64s(&y)),
                     );
-                    let mut dxs: Vec<Vec<f32>> = maps.iter().map(|x| vec![f32::NAN; x.len()]).collect();
-                    let mut slots: Vec<Option<&mut [f32]>> = dxs.iter_mut().map(|dx| Some(&mut dx[..])).collect();
-                    let (mut dweight, mut dbias) = (vec![f32::NAN; weight.len()], vec![f32::NAN; outputs]);
-                    backward(isa, grid, &xs, &weight, Some(&y), &dy, &mut slots, &mut dweight, &mut dbias);
+                    let mut dxs: Vec<Vec<f32>> =
+                        maps.iter().map(|x| vec![f32::NAN; x.len()]).collect();
+                    let mut slots: Vec<Option<&mut [f32]>> =
+                        dxs.iter_mut().map(|dx| Some(&mut dx[..])).collect();
+                    let (mut dweight, mut dbias) =
+                        (vec![f32::NAN; weight.len()], vec![f32::NAN; outputs]);
+                    backward(
+                        isa,
+                        grid,
+                        &xs,
+                        &weight,
+                        Some(&y),
+                        &dy,
+                        &mut slots,
+                        &mut dweight,
+                        &mut dbias,
+                    );
                     let dxs: Vec<&[f32]> = dxs.iter().map(|x| &x[..]).collect();
-                    let found: Vec<f32> = concatenated(grid, &dxs).iter().map(|x| *x as f32).collect();
+                    let found: Vec<f32> =
+                        concatenated(grid, &dxs).iter().map(|x| *x as f32).collect();
                     assert_close(&format!("{name} dx"), &found, &expected.dx);
                     assert_close(&format!("{name} dweight"), &dweight, &expected.dweight);
                     assert_close(&format!("{name} dbias"), &dbias, &expected.dbias);

@@ -87,14 +87,31 @@ impl<'a> Ready<'a> {
     pub fn new(isa: Isa, tile: Tile, weight: &'a [f32], bias: &'a [f32], relu: bool) -> Self {
         let outputs = bias.len();
         let inputs = weight.len() / (9 * outputs);
-        assert_eq!(weight.len(), outputs * inputs * 9, "a weight of {inputs} to {outputs} channels");
+        assert_eq!(
+            weight.len(),
+            outputs * inputs * 9,
+            "a weight of {inputs} to {outputs} channels"
+        );
         let weights = match tile {
             _ if !is_wide(inputs, outputs) => Weights::Thin(weight),
-            Tile::F2 => Weights::F2(winograd::Weights::new::<4>(isa, weight, outputs, inputs, false)),
-            Tile::F4 => Weights::F4(winograd::Weights::new::<6>(isa, weight, outputs, inputs, false)),
+            Tile::F2 => Weights::F2(winograd::Weights::new::<4>(
+                isa, weight, outputs, inputs, false,
+            )),
+            Tile::F4 => Weights::F4(winograd::Weights::new::<6>(
+                isa, weight, outputs, inputs, false,
+            )),
         };
-        let finish = Finish { bias: Some(bias), relu };
-        Ready { isa, weights, finish, inputs, outputs }
+        let finish = Finish {
+            bias: Some(bias),
+            relu,
+        };
+        Ready {
+            isa,
+            weights,
+            finish,
+            inputs,
+            outputs,
+        }
     }
 
     /// Output channels.
@@ -112,16 +129,29 @@ impl<'a> Ready<'a> {
     /// # Panics
     /// Where the lengths do not fit.
     pub fn forward(&self, grid: Grid, x: &[f32], above: usize, y: &mut [f32]) {
-        assert_eq!(x.len(), grid.pixels() * self.inputs, "a map of {} channels on {grid:?}", self.inputs);
+        assert_eq!(
+            x.len(),
+            grid.pixels() * self.inputs,
+            "a map of {} channels on {grid:?}",
+            self.inputs
+        );
         let row = grid.batch * grid.width * self.outputs;
-        assert!(y.len().is_multiple_of(row), "an output of {} channels on {grid:?}", self.outputs);
+        assert!(
+            y.len().is_multiple_of(row),
+            "an output of {} channels on {grid:?}",
+            self.outputs
+        );
         match &self.weights {
             Weights::Thin(weight) => {
                 let axes = thin::Axes::new(self.outputs, self.inputs, false);
                 thin::convolve(self.isa, grid, x, None, above, weight, axes, self.finish, y);
             }
-            Weights::F2(weights) => winograd::convolve_rows::<4>(grid, x, None, above, weights, self.finish, y),
-            Weights::F4(weights) => winograd::convolve_rows::<6>(grid, x, None, above, weights, self.finish, y),
+            Weights::F2(weights) => {
+                winograd::convolve_rows::<4>(grid, x, None, above, weights, self.finish, y)
+            }
+            Weights::F4(weights) => {
+                winograd::convolve_rows::<6>(grid, x, None, above, weights, self.finish, y)
+            }
         }
     }
 }
@@ -149,8 +179,15 @@ pub fn backward(
 ) {
     let (inputs, outputs) = check(grid, x.len(), weight.len(), dbias.len(), dy.len());
     assert_eq!(dweight.len(), weight.len(), "a weight's gradient");
-    assert!(y.is_none_or(|y| y.len() == dy.len()), "an output of {} values", dy.len());
-    let nothing = Finish { bias: None, relu: false };
+    assert!(
+        y.is_none_or(|y| y.len() == dy.len()),
+        "an output of {} values",
+        dy.len()
+    );
+    let nothing = Finish {
+        bias: None,
+        relu: false,
+    };
     if is_wide(inputs, outputs) {
         if let Some(dx) = dx {
             let weights = winograd::Weights::new::<TILE>(isa, weight, outputs, inputs, true);
@@ -169,22 +206,39 @@ pub fn backward(
 /// Input and output channels.
 fn check(grid: Grid, x: usize, weight: usize, outputs: usize, y: usize) -> (usize, usize) {
     let inputs = grid.channels(x);
-    assert_eq!(y, grid.pixels() * outputs, "an output of {outputs} channels on {grid:?}");
-    assert_eq!(weight, outputs * inputs * 9, "a weight of {inputs} to {outputs} channels");
+    assert_eq!(
+        y,
+        grid.pixels() * outputs,
+        "an output of {outputs} channels on {grid:?}"
+    );
+    assert_eq!(
+        weight,
+        outputs * inputs * 9,
+        "a weight of {inputs} to {outputs} channels"
+    );
     (inputs, outputs)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{assert_close, f64s, grids, pattern};
     use crate::reference;
+    use crate::testing::{assert_close, f64s, grids, pattern};
 
     #[test]
     fn equals_the_reference_on_every_path_at_odd_sizes() {
         for isa in Isa::available() {
             for (case, grid) in grids().into_iter().enumerate() {
-                for (inputs, outputs) in [(3, 8), (12, 5), (1, 1), (9, 3), (8, 8), (17, 33), (20, 8), (66, 16)] {
+                for (inputs, outputs) in [
+                    (3, 8),
+                    (12, 5),
+                    (1, 1),
+                    (9, 3),
+                    (8, 8),
+                    (17, 33),
+                    (20, 8),
+                    (66, 16),
+                ] {
                     let x = pattern(grid.pixels() * inputs, 1 + case as u32);
                     let weight = pattern(outputs * inputs * 9, 2);
                     let bias = pattern(outputs, 3);
@@ -193,7 +247,8 @@ mod tests {
                         let name = format!("{isa} {grid:?} {inputs} to {outputs}");
                         let mut y = vec![f32::NAN; dy.len()];
                         forward(isa, grid, &x, &weight, &bias, relu, &mut y);
-                        let expected = reference::conv3x3(grid, &f64s(&x), &f64s(&weight), &f64s(&bias), relu);
+                        let expected =
+                            reference::conv3x3(grid, &f64s(&x), &f64s(&weight), &f64s(&bias), relu);
                         assert_close(&format!("{name} y"), &y, &expected);
 
                         let gate = relu.then_some(&y[..]);
@@ -201,11 +256,22 @@ mod tests {
                             Some(y) => reference::gated(&f64s(&dy), &f64s(y)),
                             None => f64s(&dy),
                         };
-                        let expected = reference::conv3x3_backward(grid, &f64s(&x), &f64s(&weight), &gated);
+                        let expected =
+                            reference::conv3x3_backward(grid, &f64s(&x), &f64s(&weight), &gated);
                         let mut dx = vec![f32::NAN; x.len()];
                         let mut dweight = vec![f32::NAN; weight.len()];
                         let mut dbias = vec![f32::NAN; outputs];
-                        backward(isa, grid, &x, &weight, gate, &dy, Some(&mut dx), &mut dweight, &mut dbias);
+                        backward(
+                            isa,
+                            grid,
+                            &x,
+                            &weight,
+                            gate,
+                            &dy,
+                            Some(&mut dx),
+                            &mut dweight,
+                            &mut dbias,
+                        );
                         assert_close(&format!("{name} dx"), &dx, &expected.dx);
                         assert_close(&format!("{name} dweight"), &dweight, &expected.dweight);
                         assert_close(&format!("{name} dbias"), &dbias, &expected.dbias);
@@ -217,10 +283,17 @@ mod tests {
 
     #[test]
     fn bands_of_rows_are_the_whole() {
-        let grid = Grid { batch: 1, height: 23, width: 9 };
+        let grid = Grid {
+            batch: 1,
+            height: 23,
+            width: 9,
+        };
         for isa in Isa::available() {
             for (inputs, outputs) in [(3, 20), (20, 3), (18, 33)] {
-                let (x, weight) = (pattern(grid.pixels() * inputs, 1), pattern(outputs * inputs * 9, 2));
+                let (x, weight) = (
+                    pattern(grid.pixels() * inputs, 1),
+                    pattern(outputs * inputs * 9, 2),
+                );
                 let bias = pattern(outputs, 3);
                 for tile in [Tile::F2, Tile::F4] {
                     let mut whole = vec![f32::NAN; grid.pixels() * outputs];
@@ -228,15 +301,25 @@ mod tests {
                     let ready = Ready::new(isa, tile, &weight, &bias, true);
                     let mut bands = vec![f32::NAN; whole.len()];
                     for (first, end) in [(0, 4), (4, 16), (16, 23)] {
-                        let (from, to) = (usize::saturating_sub(first, 1), (end + 1).min(grid.height));
+                        let (from, to) =
+                            (usize::saturating_sub(first, 1), (end + 1).min(grid.height));
                         let row = grid.width * inputs;
-                        let y = &mut bands[first * grid.width * outputs..end * grid.width * outputs];
-                        let band = Grid { height: to - from, ..grid };
+                        let y =
+                            &mut bands[first * grid.width * outputs..end * grid.width * outputs];
+                        let band = Grid {
+                            height: to - from,
+                            ..grid
+                        };
                         ready.forward(band, &x[from * row..to * row], first - from, y);
                     }
                     let differs = |i: &usize| bands[*i].to_bits() != whole[*i].to_bits();
-                    let at = (0..whole.len()).find(differs).map(|i| (i / outputs, bands[i], whole[i]));
-                    assert!(at.is_none(), "{isa} {inputs} to {outputs} {tile:?}: pixel, found, expected: {at:?}");
+                    let at = (0..whole.len())
+                        .find(differs)
+                        .map(|i| (i / outputs, bands[i], whole[i]));
+                    assert!(
+                        at.is_none(),
+                        "{isa} {inputs} to {outputs} {tile:?}: pixel, found, expected: {at:?}"
+                    );
                 }
             }
         }
@@ -252,8 +335,19 @@ mod tests {
                 let bias = pattern(outputs, 3);
                 let weights = winograd::Weights::new::<6>(isa, &weight, outputs, inputs, false);
                 let mut y = vec![f32::NAN; grid.pixels() * outputs];
-                winograd::convolve::<6>(grid, &x, None, &weights, Finish { bias: Some(&bias), relu: true }, &mut y);
-                let expected = reference::conv3x3(grid, &f64s(&x), &f64s(&weight), &f64s(&bias), true);
+                winograd::convolve::<6>(
+                    grid,
+                    &x,
+                    None,
+                    &weights,
+                    Finish {
+                        bias: Some(&bias),
+                        relu: true,
+                    },
+                    &mut y,
+                );
+                let expected =
+                    reference::conv3x3(grid, &f64s(&x), &f64s(&weight), &f64s(&bias), true);
                 crate::testing::assert_within(&format!("{isa} {grid:?}"), &y, &expected, 2e-5);
             }
         }

@@ -29,7 +29,10 @@ struct Cells {
 
 impl Cells {
     fn new(grid: Grid) -> Self {
-        Cells { grid, across: grid.width + 1 }
+        Cells {
+            grid,
+            across: grid.width + 1,
+        }
     }
 
     /// Cells of an image.
@@ -46,25 +49,42 @@ impl Cells {
     ///
     /// Every image begins with a row of zeros, which ends the one before it.
     fn inputs(self, isa: Isa, x: &[f32], channels: usize) -> Scratch {
-        let Grid { batch, height, width } = self.grid;
+        let Grid {
+            batch,
+            height,
+            width,
+        } = self.grid;
         let rows = self.count() + self.across + 1;
         let mut padded = Scratch::take((rows + padded_rows(BLOCK)) * channels);
         let (head, lines) = padded.split_at_mut(channels);
         head.fill(0.0);
-        lines.par_chunks_mut(self.across * channels).enumerate().for_each(|(line, to)| {
-            let (image, row) = (line / (height + 1), line % (height + 1));
-            if image >= batch || row == 0 {
-                to.fill(0.0);
-                return;
-            }
-            let first = ((image * height + row - 1) * width) * channels;
-            let (pixels, border) = to.split_at_mut(width * channels);
-            copy(isa, Copy {
-                from: &x[first..], from_step: width * channels, gate: None, bias: None, relu: false,
-                to: pixels, to_step: width * channels, rows: 1, channels: width * channels,
+        lines
+            .par_chunks_mut(self.across * channels)
+            .enumerate()
+            .for_each(|(line, to)| {
+                let (image, row) = (line / (height + 1), line % (height + 1));
+                if image >= batch || row == 0 {
+                    to.fill(0.0);
+                    return;
+                }
+                let first = ((image * height + row - 1) * width) * channels;
+                let (pixels, border) = to.split_at_mut(width * channels);
+                copy(
+                    isa,
+                    Copy {
+                        from: &x[first..],
+                        from_step: width * channels,
+                        gate: None,
+                        bias: None,
+                        relu: false,
+                        to: pixels,
+                        to_step: width * channels,
+                        rows: 1,
+                        channels: width * channels,
+                    },
+                );
+                border.fill(0.0);
             });
-            border.fill(0.0);
-        });
         padded
     }
 
@@ -74,14 +94,28 @@ impl Cells {
     }
 
     /// The gradient by cells, `4 * channels` a cell, gated; and its sum over pixels.
-    fn gradients(self, isa: Isa, dy: &[f32], y: Option<&[f32]>, channels: usize) -> (Scratch, Vec<f64>) {
-        let Grid { batch, height, width } = self.grid;
+    fn gradients(
+        self,
+        isa: Isa,
+        dy: &[f32],
+        y: Option<&[f32]>,
+        channels: usize,
+    ) -> (Scratch, Vec<f64>) {
+        let Grid {
+            batch,
+            height,
+            width,
+        } = self.grid;
         let wide = whole(4 * channels);
         let lines = batch * (height + 1);
-        let mut cells = Scratch::take((lines * self.across + self.across + 2 + padded_rows(BLOCK)) * wide);
+        let mut cells =
+            Scratch::take((lines * self.across + self.across + 2 + padded_rows(BLOCK)) * wide);
         cells[lines * self.across * wide..].fill(0.0);
         let mut sums = vec![0.0f64; lines * channels];
-        let all = cells.par_chunks_mut(self.across * wide).take(lines).zip(sums.par_chunks_mut(channels));
+        let all = cells
+            .par_chunks_mut(self.across * wide)
+            .take(lines)
+            .zip(sums.par_chunks_mut(channels));
         all.enumerate().for_each(|(line, (cells, sums))| {
             let (image, row) = (line / (height + 1), line % (height + 1));
             if row == 0 || row == height || wide != 4 * channels {
@@ -91,22 +125,36 @@ impl Cells {
                 cells[width * wide..].fill(0.0);
             }
             for py in 0..2 {
-                let Some(y_row) = (2 * row + py).checked_sub(1).filter(|y| *y < 2 * height) else { continue };
+                let Some(y_row) = (2 * row + py).checked_sub(1).filter(|y| *y < 2 * height) else {
+                    continue;
+                };
                 let first = ((image * 2 * height + y_row) * 2 * width) * channels;
                 for px in 0..2 {
                     // Pixels px - 1, px + 1, ...: from the first that exists.
                     let skipped = 1 - px;
                     let from = first + (px + 2 * skipped - 1) * channels;
                     let to = &mut cells[skipped * wide + (2 * py + px) * channels..];
-                    copy(isa, Copy {
-                        from: &dy[from..], from_step: 2 * channels, gate: y.map(|y| &y[from..]), bias: None, relu: false,
-                        to: &mut *to, to_step: wide, rows: width, channels,
-                    });
-                    rows::column_sums(to, wide, width, channels, sums);
+                    copy(
+                        isa,
+                        Copy {
+                            from: &dy[from..],
+                            from_step: 2 * channels,
+                            gate: y.map(|y| &y[from..]),
+                            bias: None,
+                            relu: false,
+                            to: &mut *to,
+                            to_step: wide,
+                            rows: width,
+                            channels,
+                        },
+                    );
+                    rows::column_sums(isa, to, wide, width, channels, sums);
                 }
             }
         });
-        let total = (0..channels).map(|o| sums[o..].iter().step_by(channels).sum()).collect();
+        let total = (0..channels)
+            .map(|o| sums[o..].iter().step_by(channels).sum())
+            .collect();
         (cells, total)
     }
 }
@@ -129,7 +177,12 @@ impl Leaf for Pack<'_> {
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
         const WIDEST: usize = 16;
-        let Pack { inputs, outputs, transposed, .. } = self;
+        let Pack {
+            inputs,
+            outputs,
+            transposed,
+            ..
+        } = self;
         let (depth, columns, lanes_of) = match transposed {
             false => (inputs, 4 * outputs, outputs),
             true => (4 * outputs, inputs, inputs),
@@ -141,7 +194,11 @@ impl Leaf for Pack<'_> {
                 let count = S::LANES.min(lanes_of - first);
                 let mut taps = [[0.0; WIDEST]; 16];
                 for lane in 0..count {
-                    let (input, output) = if transposed { (first + lane, index) } else { (index, first + lane) };
+                    let (input, output) = if transposed {
+                        (first + lane, index)
+                    } else {
+                        (index, first + lane)
+                    };
                     let from = (input * outputs + output) * 16;
                     for (values, weight) in taps.iter_mut().zip(&self.weight[from..from + 16]) {
                         values[lane] = *weight;
@@ -151,11 +208,18 @@ impl Leaf for Pack<'_> {
                     let (y, x) = (t / 4, t % 4);
                     let (tap, phase) = (y / 2 * 2 + x / 2, y % 2 * 2 + x % 2);
                     let to = self.to[tap].pointer();
-                    let (row, column) = if transposed { (phase * outputs + index, first) } else { (index, phase * outputs + first) };
+                    let (row, column) = if transposed {
+                        (phase * outputs + index, first)
+                    } else {
+                        (index, phase * outputs + first)
+                    };
                     // SAFETY: the row of this index is this leaf's; vectors and columns lie within the operand.
                     unsafe {
                         if column % S::LANES == 0 && (count == S::LANES || transposed) {
-                            S::store(to.add(panels.place(depth, row, column)), S::load(values.as_ptr()));
+                            S::store(
+                                to.add(panels.place(depth, row, column)),
+                                S::load(values.as_ptr()),
+                            );
                         } else {
                             for (lane, value) in values[..count].iter().enumerate() {
                                 *to.add(panels.place(depth, row, column + lane)) = *value;
@@ -169,7 +233,13 @@ impl Leaf for Pack<'_> {
 }
 
 /// The four matrices of a weight, of [`TAPS`].
-fn packed(isa: Isa, weight: &[f32], inputs: usize, outputs: usize, transposed: bool) -> [Packed; 4] {
+fn packed(
+    isa: Isa,
+    weight: &[f32],
+    inputs: usize,
+    outputs: usize,
+    transposed: bool,
+) -> [Packed; 4] {
     let (depth, columns, count) = match transposed {
         false => (inputs, 4 * outputs, inputs),
         true => (4 * outputs, inputs, outputs),
@@ -181,7 +251,19 @@ fn packed(isa: Isa, weight: &[f32], inputs: usize, outputs: usize, transposed: b
     (0..count.div_ceil(step)).into_par_iter().for_each(|task| {
         let range = task * step..((task + 1) * step).min(count);
         // SAFETY: tasks write different rows.
-        unsafe { run(isa, Pack { weight, inputs, outputs, transposed, range, to }) };
+        unsafe {
+            run(
+                isa,
+                Pack {
+                    weight,
+                    inputs,
+                    outputs,
+                    transposed,
+                    range,
+                    to,
+                },
+            )
+        };
     });
     packed
 }
@@ -224,9 +306,19 @@ impl<'a> Ready<'a> {
     pub fn new(isa: Isa, weight: &[f32], bias: &'a [f32], relu: bool) -> Self {
         let outputs = bias.len();
         let inputs = weight.len() / (16 * outputs);
-        assert_eq!(weight.len(), inputs * outputs * 16, "a weight of {inputs} to {outputs} channels");
+        assert_eq!(
+            weight.len(),
+            inputs * outputs * 16,
+            "a weight of {inputs} to {outputs} channels"
+        );
         let weights = packed(isa, weight, inputs, outputs, false);
-        Ready { isa, weights, bias, relu, inputs }
+        Ready {
+            isa,
+            weights,
+            bias,
+            relu,
+            inputs,
+        }
     }
 
     /// Output channels.
@@ -243,61 +335,109 @@ impl<'a> Ready<'a> {
     /// # Panics
     /// Where the lengths do not fit.
     pub fn forward(&self, grid: Grid, x: &[f32], above: usize, y: &mut [f32]) {
-        let Ready { isa, weights, bias, relu, inputs } = self;
+        let Ready {
+            isa,
+            weights,
+            bias,
+            relu,
+            inputs,
+        } = self;
         let (isa, relu, inputs, outputs) = (*isa, *relu, *inputs, bias.len());
         let row = grid.batch * 2 * grid.width * outputs;
         let height = y.len() / row;
-        assert_eq!(x.len(), grid.pixels() * inputs, "a map of {inputs} channels on {grid:?}");
-        assert!(y.len() == height * row && height % 2 == 0, "an output of {outputs} channels on twice {grid:?}");
-        assert!(above + height / 2 <= grid.height, "rows {above} to {} of {grid:?}", above + height / 2);
-        assert!(grid.batch == 1 || height == 2 * grid.height, "a band of a single image");
+        assert_eq!(
+            x.len(),
+            grid.pixels() * inputs,
+            "a map of {inputs} channels on {grid:?}"
+        );
+        assert!(
+            y.len() == height * row && height.is_multiple_of(2),
+            "an output of {outputs} channels on twice {grid:?}"
+        );
+        assert!(
+            above + height / 2 <= grid.height,
+            "rows {above} to {} of {grid:?}",
+            above + height / 2
+        );
+        assert!(
+            grid.batch == 1 || height == 2 * grid.height,
+            "a band of a single image"
+        );
         let cells = Cells::new(grid);
         // Those of the asked rows: a line of cells gives a row to the one above and a row to the one below.
         let skipped = above * cells.across;
-        let cell_count = if grid.batch == 1 { (height / 2 + 1) * cells.across } else { cells.count() };
+        let cell_count = if grid.batch == 1 {
+            (height / 2 + 1) * cells.across
+        } else {
+            cells.count()
+        };
         let padded = cells.inputs(isa, x, inputs);
         let wide = whole(4 * outputs);
         let step = rows::block_rows(cell_count);
         let shared = Shared::new(y);
-        (0..cell_count.div_ceil(step)).into_par_iter().for_each(|task| {
-            let count = step.min(cell_count - task * step);
-            let first = skipped + task * step;
-            let terms: [Term; 4] = std::array::from_fn(|t| Term {
-                rows: &padded[(cells.offset(TAPS[t]) + first) * inputs..],
-                step: inputs,
-                weight: &weights[t],
-            });
-            let mut c = Scratch::take(padded_rows(count) * wide);
-            rows::sum(isa, count, &terms, &mut c, wide);
-            // The cells of a row lie side by side in two rows of the output.
-            let mut cell = first;
-            while cell < first + count {
-                let (line, column) = (cell / cells.across, cell % cells.across);
-                let (image, row) = (line / (grid.height + 1), line % (grid.height + 1));
-                let run = (cells.across - column).min(first + count - cell);
-                for phase in 0..4 {
-                    let (py, px) = (phase / 2, phase % 2);
-                    let Some(y_row) = (2 * row + py).checked_sub(1 + 2 * above).filter(|y| *y < height) else { continue };
-                    // Cells whose pixel 2 * column + px - 1 exists.
-                    let skipped = usize::from(2 * column + px == 0);
-                    let past = usize::from(2 * (column + run - 1) + px > 2 * grid.width);
-                    if skipped + past >= run {
-                        continue;
+        (0..cell_count.div_ceil(step))
+            .into_par_iter()
+            .for_each(|task| {
+                let count = step.min(cell_count - task * step);
+                let first = skipped + task * step;
+                let terms: [Term; 4] = std::array::from_fn(|t| Term {
+                    rows: &padded[(cells.offset(TAPS[t]) + first) * inputs..],
+                    step: inputs,
+                    weight: &weights[t],
+                });
+                let mut c = Scratch::take(padded_rows(count) * wide);
+                rows::sum(isa, count, &terms, &mut c, wide);
+                // The cells of a row lie side by side in two rows of the output.
+                let mut cell = first;
+                while cell < first + count {
+                    let (line, column) = (cell / cells.across, cell % cells.across);
+                    let (image, row) = (line / (grid.height + 1), line % (grid.height + 1));
+                    let run = (cells.across - column).min(first + count - cell);
+                    for phase in 0..4 {
+                        let (py, px) = (phase / 2, phase % 2);
+                        let Some(y_row) = (2 * row + py)
+                            .checked_sub(1 + 2 * above)
+                            .filter(|y| *y < height)
+                        else {
+                            continue;
+                        };
+                        // Cells whose pixel 2 * column + px - 1 exists.
+                        let skipped = usize::from(2 * column + px == 0);
+                        let past = usize::from(2 * (column + run - 1) + px > 2 * grid.width);
+                        if skipped + past >= run {
+                            continue;
+                        }
+                        let rows = run - skipped - past;
+                        let pixel =
+                            (image * height + y_row) * 2 * grid.width + 2 * (column + skipped) + px
+                                - 1;
+                        let len = ((rows - 1) * 2 + 1) * outputs;
+                        // SAFETY: tasks write the pixels of different cells, and a phase is one pixel of a cell; the slice spans
+                        // pixels of other phases too, which nobody but this task's own loop writes meanwhile.
+                        let to = unsafe {
+                            std::slice::from_raw_parts_mut(
+                                shared.pointer().add(pixel * outputs),
+                                len,
+                            )
+                        };
+                        copy(
+                            isa,
+                            Copy {
+                                from: &c[(cell - first + skipped) * wide + phase * outputs..],
+                                from_step: wide,
+                                gate: None,
+                                bias: Some(bias),
+                                relu,
+                                to,
+                                to_step: 2 * outputs,
+                                rows,
+                                channels: outputs,
+                            },
+                        );
                     }
-                    let rows = run - skipped - past;
-                    let pixel = (image * height + y_row) * 2 * grid.width + 2 * (column + skipped) + px - 1;
-                    let len = ((rows - 1) * 2 + 1) * outputs;
-                    // SAFETY: tasks write the pixels of different cells, and a phase is one pixel of a cell; the slice spans
-                    // pixels of other phases too, which nobody but this task's own loop writes meanwhile.
-                    let to = unsafe { std::slice::from_raw_parts_mut(shared.pointer().add(pixel * outputs), len) };
-                    copy(isa, Copy {
-                        from: &c[(cell - first + skipped) * wide + phase * outputs..], from_step: wide, gate: None,
-                        bias: Some(bias), relu, to, to_step: 2 * outputs, rows, channels: outputs,
-                    });
+                    cell += run;
                 }
-                cell += run;
-            }
-        });
+            });
     }
 }
 
@@ -324,7 +464,11 @@ pub fn backward(
 ) {
     let (inputs, outputs) = check(grid, x.len(), weight.len(), dbias.len(), dy.len());
     assert_eq!(dweight.len(), weight.len(), "a weight's gradient");
-    assert!(y.is_none_or(|y| y.len() == dy.len()), "an output of {} values", dy.len());
+    assert!(
+        y.is_none_or(|y| y.len() == dy.len()),
+        "an output of {} values",
+        dy.len()
+    );
     let cells = Cells::new(grid);
     let wide = whole(4 * outputs);
     let (gradients, sums) = cells.gradients(isa, dy, y, outputs);
@@ -338,34 +482,55 @@ pub fn backward(
         let c_step = whole(inputs);
         let step = rows::block_rows(cells.count());
         let shared = Shared::new(dx);
-        (0..cells.count().div_ceil(step)).into_par_iter().for_each(|task| {
-            let first = task * step;
-            let count = step.min(cells.count() - first);
-            let terms: [Term; 4] = std::array::from_fn(|t| {
-                let (dy, dx) = TAPS[t];
-                Term { rows: &gradients[(first + dy * cells.across + dx) * wide..], step: wide, weight: &weights[t] }
-            });
-            let mut c = Scratch::take(padded_rows(count) * c_step);
-            rows::sum(isa, count, &terms, &mut c, c_step);
-            // Of the cells of a row all but the last are pixels of the input, of the rows all but the last.
-            let mut cell = first;
-            while cell < first + count {
-                let (line, column) = (cell / cells.across, cell % cells.across);
-                let (image, row) = (line / (grid.height + 1), line % (grid.height + 1));
-                let run = (cells.across - column).min(first + count - cell);
-                let rows = run.min(grid.width - column);
-                if row < grid.height && rows > 0 {
-                    let pixel = (image * grid.height + row) * grid.width + column;
-                    // SAFETY: tasks write different pixels.
-                    let to = unsafe { std::slice::from_raw_parts_mut(shared.pointer().add(pixel * inputs), rows * inputs) };
-                    copy(isa, Copy {
-                        from: &c[(cell - first) * c_step..], from_step: c_step, gate: None, bias: None, relu: false,
-                        to, to_step: inputs, rows, channels: inputs,
-                    });
+        (0..cells.count().div_ceil(step))
+            .into_par_iter()
+            .for_each(|task| {
+                let first = task * step;
+                let count = step.min(cells.count() - first);
+                let terms: [Term; 4] = std::array::from_fn(|t| {
+                    let (dy, dx) = TAPS[t];
+                    Term {
+                        rows: &gradients[(first + dy * cells.across + dx) * wide..],
+                        step: wide,
+                        weight: &weights[t],
+                    }
+                });
+                let mut c = Scratch::take(padded_rows(count) * c_step);
+                rows::sum(isa, count, &terms, &mut c, c_step);
+                // Of the cells of a row all but the last are pixels of the input, of the rows all but the last.
+                let mut cell = first;
+                while cell < first + count {
+                    let (line, column) = (cell / cells.across, cell % cells.across);
+                    let (image, row) = (line / (grid.height + 1), line % (grid.height + 1));
+                    let run = (cells.across - column).min(first + count - cell);
+                    let rows = run.min(grid.width - column);
+                    if row < grid.height && rows > 0 {
+                        let pixel = (image * grid.height + row) * grid.width + column;
+                        // SAFETY: tasks write different pixels.
+                        let to = unsafe {
+                            std::slice::from_raw_parts_mut(
+                                shared.pointer().add(pixel * inputs),
+                                rows * inputs,
+                            )
+                        };
+                        copy(
+                            isa,
+                            Copy {
+                                from: &c[(cell - first) * c_step..],
+                                from_step: c_step,
+                                gate: None,
+                                bias: None,
+                                relu: false,
+                                to,
+                                to_step: inputs,
+                                rows,
+                                channels: inputs,
+                            },
+                        );
+                    }
+                    cell += run;
                 }
-                cell += run;
-            }
-        });
+            });
     }
 
     let padded = cells.inputs(isa, x, inputs);
@@ -380,22 +545,34 @@ pub fn backward(
     });
     let products = rows::outer(isa, &outers, wide);
     let size = padded_rows(inputs) * wide;
-    dweight.par_chunks_mut(outputs * 16).enumerate().for_each(|(input, dweight)| {
-        let rows: [&[f32]; 4] = std::array::from_fn(|t| &products[t * size + input * wide..][..4 * outputs]);
-        for (output, dweight) in dweight.chunks_exact_mut(16).enumerate() {
-            for (t, dweight) in dweight.iter_mut().enumerate() {
-                let (y, x) = (t / 4, t % 4);
-                *dweight = rows[y / 2 * 2 + x / 2][(y % 2 * 2 + x % 2) * outputs + output];
+    dweight
+        .par_chunks_mut(outputs * 16)
+        .enumerate()
+        .for_each(|(input, dweight)| {
+            let rows: [&[f32]; 4] =
+                std::array::from_fn(|t| &products[t * size + input * wide..][..4 * outputs]);
+            for (output, dweight) in dweight.chunks_exact_mut(16).enumerate() {
+                for (t, dweight) in dweight.iter_mut().enumerate() {
+                    let (y, x) = (t / 4, t % 4);
+                    *dweight = rows[y / 2 * 2 + x / 2][(y % 2 * 2 + x % 2) * outputs + output];
+                }
             }
-        }
-    });
+        });
 }
 
 /// Input and output channels.
 fn check(grid: Grid, x: usize, weight: usize, outputs: usize, y: usize) -> (usize, usize) {
     let inputs = grid.channels(x);
-    assert_eq!(y, grid.doubled().pixels() * outputs, "an output of {outputs} channels on twice {grid:?}");
-    assert_eq!(weight, inputs * outputs * 16, "a weight of {inputs} to {outputs} channels");
+    assert_eq!(
+        y,
+        grid.doubled().pixels() * outputs,
+        "an output of {outputs} channels on twice {grid:?}"
+    );
+    assert_eq!(
+        weight,
+        inputs * outputs * 16,
+        "a weight of {inputs} to {outputs} channels"
+    );
     (inputs, outputs)
 }
 
@@ -407,10 +584,17 @@ mod tests {
 
     #[test]
     fn bands_of_rows_are_the_whole() {
-        let grid = Grid { batch: 1, height: 11, width: 9 };
+        let grid = Grid {
+            batch: 1,
+            height: 11,
+            width: 9,
+        };
         let (inputs, outputs) = (18, 7);
         for isa in Isa::available() {
-            let (x, weight) = (pattern(grid.pixels() * inputs, 1), pattern(outputs * inputs * 16, 2));
+            let (x, weight) = (
+                pattern(grid.pixels() * inputs, 1),
+                pattern(outputs * inputs * 16, 2),
+            );
             let bias = pattern(outputs, 3);
             let mut whole = vec![f32::NAN; grid.doubled().pixels() * outputs];
             forward(isa, grid, &x, &weight, &bias, true, &mut whole);
@@ -419,8 +603,16 @@ mod tests {
             for (first, end) in [(0, 1), (1, 7), (7, 11)] {
                 let (from, to) = (usize::saturating_sub(first, 1), (end + 1).min(grid.height));
                 let (row, y_row) = (grid.width * inputs, 4 * grid.width * outputs);
-                let band = Grid { height: to - from, ..grid };
-                ready.forward(band, &x[from * row..to * row], first - from, &mut bands[first * y_row..end * y_row]);
+                let band = Grid {
+                    height: to - from,
+                    ..grid
+                };
+                ready.forward(
+                    band,
+                    &x[from * row..to * row],
+                    first - from,
+                    &mut bands[first * y_row..end * y_row],
+                );
             }
             assert!(bands == whole, "{isa}");
         }
@@ -433,12 +625,19 @@ mod tests {
                 for (inputs, outputs) in [(1, 1), (6, 5), (17, 8), (33, 20)] {
                     for relu in [false, true] {
                         let x = pattern(grid.pixels() * inputs, 1);
-                        let (weight, bias) = (pattern(inputs * outputs * 16, 2), pattern(outputs, 3));
+                        let (weight, bias) =
+                            (pattern(inputs * outputs * 16, 2), pattern(outputs, 3));
                         let dy = pattern(grid.doubled().pixels() * outputs, 4);
                         let name = format!("{isa} {grid:?} {inputs} to {outputs}");
                         let mut y = vec![f32::NAN; dy.len()];
                         forward(isa, grid, &x, &weight, &bias, relu, &mut y);
-                        let expected = reference::deconv4x4(grid, &f64s(&x), &f64s(&weight), &f64s(&bias), relu);
+                        let expected = reference::deconv4x4(
+                            grid,
+                            &f64s(&x),
+                            &f64s(&weight),
+                            &f64s(&bias),
+                            relu,
+                        );
                         assert_close(&format!("{name} y"), &y, &expected);
 
                         let gate = relu.then_some(&y[..]);
@@ -446,11 +645,22 @@ mod tests {
                             Some(y) => reference::gated(&f64s(&dy), &f64s(y)),
                             None => f64s(&dy),
                         };
-                        let expected = reference::deconv4x4_backward(grid, &f64s(&x), &f64s(&weight), &gated);
+                        let expected =
+                            reference::deconv4x4_backward(grid, &f64s(&x), &f64s(&weight), &gated);
                         let mut dx = vec![f32::NAN; x.len()];
                         let mut dweight = vec![f32::NAN; weight.len()];
                         let mut dbias = vec![f32::NAN; outputs];
-                        backward(isa, grid, &x, &weight, gate, &dy, Some(&mut dx), &mut dweight, &mut dbias);
+                        backward(
+                            isa,
+                            grid,
+                            &x,
+                            &weight,
+                            gate,
+                            &dy,
+                            Some(&mut dx),
+                            &mut dweight,
+                            &mut dbias,
+                        );
                         assert_close(&format!("{name} dx"), &dx, &expected.dx);
                         assert_close(&format!("{name} dweight"), &dweight, &expected.dweight);
                         assert_close(&format!("{name} dbias"), &dbias, &expected.dbias);

@@ -56,7 +56,9 @@ impl Isa {
         }
         match self {
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx512 => std::arch::is_x86_feature_detected!("avx512f") && Isa::Avx2.is_available(),
+            Isa::Avx512 => {
+                std::arch::is_x86_feature_detected!("avx512f") && Isa::Avx2.is_available()
+            }
             #[cfg(target_arch = "x86_64")]
             Isa::Avx2 => {
                 std::arch::is_x86_feature_detected!("avx2")
@@ -72,7 +74,10 @@ impl Isa {
 
     /// The paths of this machine, best first.
     pub fn available() -> Vec<Isa> {
-        Isa::ALL.into_iter().filter(|isa| isa.is_available()).collect()
+        Isa::ALL
+            .into_iter()
+            .filter(|isa| isa.is_available())
+            .collect()
     }
 
     /// The path to use: the one forced, else the one that the variable [`VARIABLE`] names, else the best.
@@ -138,6 +143,9 @@ mod tests {
             assert_eq!(isa.name().parse(), Ok(isa));
         }
         let message = "sse9".parse::<Isa>().expect_err("unknown").to_string();
-        assert!(message.contains("`sse9`") && message.contains("portable"), "{message}");
+        assert!(
+            message.contains("`sse9`") && message.contains("portable"),
+            "{message}"
+        );
     }
 }

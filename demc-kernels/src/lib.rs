@@ -25,11 +25,11 @@ pub mod rel_mse;
 mod rows;
 mod scratch;
 mod simd;
+mod tasks;
 #[cfg(test)]
 mod testing;
 mod thin;
 mod winograd;
-mod tasks;
 
 pub use grid::Grid;
 pub use isa::Isa;

@@ -47,7 +47,10 @@ struct Kept {
 }
 
 static KEPT: Mutex<Kept> = Mutex::new(Kept {
-    blocks: [Block { address: 0, size: 0 }; MOST_KEPT],
+    blocks: [Block {
+        address: 0,
+        size: 0,
+    }; MOST_KEPT],
     count: 0,
     bytes: 0,
     used: 0,
@@ -76,10 +79,15 @@ impl Kept {
         self.used += size;
         self.most_used = self.most_used.max(self.used);
         let fitting = (0..self.count).filter(|i| self.blocks[*i].size >= size);
-        let block = fitting.min_by_key(|i| self.blocks[*i].size).map(|i| self.remove(i))?;
+        let block = fitting
+            .min_by_key(|i| self.blocks[*i].size)
+            .map(|i| self.remove(i))?;
         if block.size > size {
             // From the end, so that what stays begins where a large page does.
-            self.insert(Block { address: block.address, size: block.size - size });
+            self.insert(Block {
+                address: block.address,
+                size: block.size - size,
+            });
         }
         Some(block.address + block.size - size)
     }
@@ -89,10 +97,16 @@ impl Kept {
         self.used -= block.size;
         for index in (0..self.count).rev() {
             let other = self.blocks[index];
-            let (below, above) = (other.address + other.size == block.address, block.address + block.size == other.address);
+            let (below, above) = (
+                other.address + other.size == block.address,
+                block.address + block.size == other.address,
+            );
             if below || above {
                 self.remove(index);
-                block = Block { address: block.address.min(other.address), size: block.size + other.size };
+                block = Block {
+                    address: block.address.min(other.address),
+                    size: block.size + other.size,
+                };
             }
         }
         if self.count == MOST_KEPT {
@@ -118,7 +132,9 @@ fn kept() -> std::sync::MutexGuard<'static, Kept> {
 /// Bytes of the block for an allocation; none where the system's allocator has it.
 fn block_size(size: usize, align: usize) -> Option<usize> {
     let large = cfg!(all(target_os = "linux", not(miri))) && size >= LARGE && align <= GRAIN;
-    large.then(|| size.checked_next_multiple_of(GRAIN)).flatten()
+    large
+        .then(|| size.checked_next_multiple_of(GRAIN))
+        .flatten()
 }
 
 /// A block, all of it initialised, and whether it is zeros; null where there is no memory.
@@ -134,7 +150,10 @@ fn block(size: usize) -> (*mut u8, bool) {
 /// # Safety
 /// It came from [`block`], of this size, and nobody uses it any more.
 unsafe fn release(pointer: *mut u8, size: usize) {
-    let mut surplus = kept().put(Block { address: pointer.expose_provenance(), size });
+    let mut surplus = kept().put(Block {
+        address: pointer.expose_provenance(),
+        size,
+    });
     while let Some(Block { address, size }) = surplus.or_else(|| kept().surplus()) {
         // SAFETY: the caller's; joined blocks are whole pages that were mapped, and nobody's.
         unsafe { system::unmap(std::ptr::with_exposed_provenance_mut(address), size) };
@@ -152,7 +171,10 @@ mod system {
         let Some(with_room) = size.checked_add(LARGE) else {
             return std::ptr::null_mut();
         };
-        let (access, kind) = (libc::PROT_READ | libc::PROT_WRITE, libc::MAP_PRIVATE | libc::MAP_ANONYMOUS);
+        let (access, kind) = (
+            libc::PROT_READ | libc::PROT_WRITE,
+            libc::MAP_PRIVATE | libc::MAP_ANONYMOUS,
+        );
         // SAFETY: a mapping at an address of the kernel's choice; what is unmapped is its own unused ends.
         unsafe {
             let start = libc::mmap(std::ptr::null_mut(), with_room, access, kind, -1, 0);
@@ -196,7 +218,9 @@ mod system {
 /// A buffer of `len` values to write into: those of an earlier user where [`Recycler`] is the process's allocator, so
 /// that no time goes into zeros that nobody reads; zeros elsewhere.
 pub fn buffer(len: usize) -> Vec<f32> {
-    let size = len.checked_mul(size_of::<f32>()).and_then(|size| block_size(size, align_of::<f32>()));
+    let size = len
+        .checked_mul(size_of::<f32>())
+        .and_then(|size| block_size(size, align_of::<f32>()));
     let Some(size) = size.filter(|_| INSTALLED.load(Ordering::Relaxed)) else {
         return vec![0.0; len];
     };
@@ -251,7 +275,10 @@ unsafe impl GlobalAlloc for Recycler {
         let Ok(grown) = Layout::from_size_align(size, layout.align()) else {
             return std::ptr::null_mut();
         };
-        let (old, new) = (block_size(layout.size(), layout.align()), block_size(size, layout.align()));
+        let (old, new) = (
+            block_size(layout.size(), layout.align()),
+            block_size(size, layout.align()),
+        );
         if old.is_none() && new.is_none() {
             // SAFETY: the caller's.
             return unsafe { System.realloc(pointer, layout, size) };
@@ -284,7 +311,11 @@ mod tests {
             first.write_bytes(7, layout.size());
             Recycler.dealloc(first, layout);
             let second = Recycler.alloc_zeroed(layout);
-            assert!(std::slice::from_raw_parts(second, layout.size()).iter().all(|x| *x == 0));
+            assert!(
+                std::slice::from_raw_parts(second, layout.size())
+                    .iter()
+                    .all(|x| *x == 0)
+            );
             Recycler.dealloc(second, layout);
         }
     }
@@ -297,25 +328,75 @@ mod tests {
             let small = Recycler.alloc(layout);
             small.write_bytes(3, 100);
             let large = Recycler.realloc(small, layout, 2 * LARGE);
-            assert!(std::slice::from_raw_parts(large, 100).iter().all(|x| *x == 3));
-            Recycler.dealloc(large, Layout::from_size_align(2 * LARGE, 4).expect("a layout"));
+            assert!(
+                std::slice::from_raw_parts(large, 100)
+                    .iter()
+                    .all(|x| *x == 3)
+            );
+            Recycler.dealloc(
+                large,
+                Layout::from_size_align(2 * LARGE, 4).expect("a layout"),
+            );
         }
     }
 
     #[test]
     fn memory_is_cut_and_joined_again() {
-        let mut kept = Kept { blocks: [Block { address: 0, size: 0 }; MOST_KEPT], count: 0, bytes: 0, used: 0, most_used: 0 };
+        let mut kept = Kept {
+            blocks: [Block {
+                address: 0,
+                size: 0,
+            }; MOST_KEPT],
+            count: 0,
+            bytes: 0,
+            used: 0,
+            most_used: 0,
+        };
         assert_eq!(kept.take(10), None);
-        assert!(kept.put(Block { address: 100, size: 10 }).is_none());
-        let (end, start) = (kept.take(4).expect("a part"), kept.take(6).expect("the rest"));
+        assert!(
+            kept.put(Block {
+                address: 100,
+                size: 10
+            })
+            .is_none()
+        );
+        let (end, start) = (
+            kept.take(4).expect("a part"),
+            kept.take(6).expect("the rest"),
+        );
         assert_eq!((start, end), (100, 106));
-        assert!(kept.put(Block { address: end, size: 4 }).is_none());
-        assert!(kept.put(Block { address: start, size: 6 }).is_none());
-        assert_eq!((kept.count, kept.bytes, kept.blocks[0].address), (1, 10, 100));
+        assert!(
+            kept.put(Block {
+                address: end,
+                size: 4
+            })
+            .is_none()
+        );
+        assert!(
+            kept.put(Block {
+                address: start,
+                size: 6
+            })
+            .is_none()
+        );
+        assert_eq!(
+            (kept.count, kept.bytes, kept.blocks[0].address),
+            (1, 10, 100)
+        );
         // More than was ever used is not kept.
         assert_eq!(kept.take(12), None);
-        assert!(kept.put(Block { address: 200, size: 12 }).is_none());
-        assert_eq!(kept.surplus().map(|block| block.address), Some(100), "the smaller one");
+        assert!(
+            kept.put(Block {
+                address: 200,
+                size: 12
+            })
+            .is_none()
+        );
+        assert_eq!(
+            kept.surplus().map(|block| block.address),
+            Some(100),
+            "the smaller one"
+        );
         assert!(kept.surplus().is_none());
     }
 

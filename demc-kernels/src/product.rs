@@ -127,7 +127,10 @@ unsafe fn strip<S: Simd, const R: usize, const V: usize>(
 
 /// `R` rows of `V` vectors, in registers.
 #[inline(always)]
-#[allow(clippy::needless_range_loop, reason = "indices of registers: loops that unroll")]
+#[allow(
+    clippy::needless_range_loop,
+    reason = "indices of registers: loops that unroll"
+)]
 unsafe fn block<S: Simd, const R: usize, const V: usize>(
     depth: usize,
     a: Left,

@@ -45,7 +45,11 @@ impl<F: Fn(usize, usize) -> f32> Leaf for Pack<'_, F> {
                 let place = panels.place(self.depth, k, first);
                 for lane in 0..S::LANES {
                     let column = first + lane;
-                    let value = if column < self.columns { (self.value)(k, column) } else { 0.0 };
+                    let value = if column < self.columns {
+                        (self.value)(k, column)
+                    } else {
+                        0.0
+                    };
                     // SAFETY: row `k` is this leaf's, and its vectors lie within the operand.
                     unsafe { *self.to.pointer().add(place + lane) = value };
                 }
@@ -68,14 +72,33 @@ impl Packed {
         (0..depth.div_ceil(step)).into_par_iter().for_each(|task| {
             let rows = task * step..((task + 1) * step).min(depth);
             // SAFETY: tasks write different rows.
-            unsafe { run(isa, Pack { rows, depth, columns, value: &value, to }) };
+            unsafe {
+                run(
+                    isa,
+                    Pack {
+                        rows,
+                        depth,
+                        columns,
+                        value: &value,
+                        to,
+                    },
+                )
+            };
         });
-        Packed { depth, columns, values }
+        Packed {
+            depth,
+            columns,
+            values,
+        }
     }
 
     /// A weight `[depth, columns]` whose packed values the caller writes.
     pub(crate) fn empty(depth: usize, columns: usize) -> Self {
-        Packed { depth, columns, values: Scratch::take(depth * whole(columns)) }
+        Packed {
+            depth,
+            columns,
+            values: Scratch::take(depth * whole(columns)),
+        }
     }
 
     /// Its columns.
@@ -91,7 +114,9 @@ impl Packed {
 
 /// Rows of a block, at most [`BLOCK`], of which there are enough for all threads.
 pub(crate) fn block_rows(rows: usize) -> usize {
-    let blocks = rows.div_ceil(BLOCK).next_multiple_of(rayon::current_num_threads());
+    let blocks = rows
+        .div_ceil(BLOCK)
+        .next_multiple_of(rayon::current_num_threads());
     rows.div_ceil(blocks)
 }
 
@@ -119,14 +144,31 @@ impl Leaf for Sum<'_> {
         let rows = padded_rows(self.count);
         assert!(self.c.len() >= rows * self.c_step, "room for {rows} rows");
         for (index, term) in self.terms.iter().enumerate() {
-            let Packed { depth, columns, values } = term.weight;
+            let Packed {
+                depth,
+                columns,
+                values,
+            } = term.weight;
             assert!(*columns <= self.c_step && term.rows.len() >= (rows - 1) * term.step + depth);
             // SAFETY: just checked; the weight was packed for this depth and these columns.
             unsafe {
-                let a = Left { start: term.rows.as_ptr(), row_step: term.step, k_step: 1 };
+                let a = Left {
+                    start: term.rows.as_ptr(),
+                    row_step: term.step,
+                    k_step: 1,
+                };
                 let b = Right::Packed(values.as_ptr());
                 let c = self.c.as_mut_ptr();
-                product::<S>(self.count, *depth, *columns, a, b, c, self.c_step, self.add || index > 0);
+                product::<S>(
+                    self.count,
+                    *depth,
+                    *columns,
+                    a,
+                    b,
+                    c,
+                    self.c_step,
+                    self.add || index > 0,
+                );
             }
         }
     }
@@ -138,13 +180,35 @@ impl Leaf for Sum<'_> {
 /// Where a slice is shorter than [`padded_rows`] of `count` need.
 pub(crate) fn sum(isa: Isa, count: usize, terms: &[Term], c: &mut [f32], c_step: usize) {
     // SAFETY: the leaf checks its lengths.
-    unsafe { run(isa, Sum { count, terms, add: false, c, c_step }) }
+    unsafe {
+        run(
+            isa,
+            Sum {
+                count,
+                terms,
+                add: false,
+                c,
+                c_step,
+            },
+        )
+    }
 }
 
 /// The same, added to what `c` holds.
 pub(crate) fn add_sum(isa: Isa, count: usize, terms: &[Term], c: &mut [f32], c_step: usize) {
     // SAFETY: the leaf checks its lengths.
-    unsafe { run(isa, Sum { count, terms, add: true, c, c_step }) }
+    unsafe {
+        run(
+            isa,
+            Sum {
+                count,
+                terms,
+                add: true,
+                c,
+                c_step,
+            },
+        )
+    }
 }
 
 /// Copies rows of channels through vectors: gate, bias, ReLU on the way.
@@ -170,10 +234,24 @@ impl Leaf for Copy<'_> {
         if self.rows == 0 {
             return;
         }
-        let Copy { from_step, to_step, channels, .. } = self;
-        assert!(self.from.len() >= (self.rows - 1) * from_step + channels, "rows to copy from");
-        assert!(self.to.len() >= (self.rows - 1) * to_step + channels, "rows to copy to");
-        assert!(self.gate.is_none_or(|gate| gate.len() >= (self.rows - 1) * from_step + channels));
+        let Copy {
+            from_step,
+            to_step,
+            channels,
+            ..
+        } = self;
+        assert!(
+            self.from.len() >= (self.rows - 1) * from_step + channels,
+            "rows to copy from"
+        );
+        assert!(
+            self.to.len() >= (self.rows - 1) * to_step + channels,
+            "rows to copy to"
+        );
+        assert!(
+            self.gate
+                .is_none_or(|gate| gate.len() >= (self.rows - 1) * from_step + channels)
+        );
         assert!(self.bias.is_none_or(|bias| bias.len() >= channels));
         for row in 0..self.rows {
             for channel in (0..channels).step_by(S::LANES) {
@@ -192,7 +270,11 @@ impl Leaf for Copy<'_> {
                         v = S::relu(v);
                     }
                     let to = self.to.as_mut_ptr().add(row * to_step + channel);
-                    if n == S::LANES { S::store(to, v) } else { S::store_part(to, n, v) }
+                    if n == S::LANES {
+                        S::store(to, v)
+                    } else {
+                        S::store_part(to, n, v)
+                    }
                 }
             }
         }
@@ -206,7 +288,13 @@ impl Leaf for Copy<'_> {
 #[inline(always)]
 unsafe fn part<S: Simd>(p: *const f32, n: usize) -> S::V {
     // SAFETY: the caller's.
-    unsafe { if n == S::LANES { S::load(p) } else { S::load_part(p, n) } }
+    unsafe {
+        if n == S::LANES {
+            S::load(p)
+        } else {
+            S::load_part(p, n)
+        }
+    }
 }
 
 /// Runs a [`Copy`].
@@ -215,12 +303,68 @@ pub(crate) fn copy(isa: Isa, copy: Copy) {
     unsafe { run(isa, copy) }
 }
 
-/// Sum over rows of each channel: `[rows, channels]` at `step` to f64.
-pub(crate) fn column_sums(rows: &[f32], step: usize, count: usize, channels: usize, sums: &mut [f64]) {
-    for row in rows.chunks(step).take(count) {
-        for (sum, value) in sums.iter_mut().zip(&row[..channels]) {
-            *sum += f64::from(*value);
+/// Sum over rows of each channel: some `rows` (their number small enough for float32), `step` values apart.
+struct ColumnSums<'a> {
+    rows: &'a [f32],
+    step: usize,
+    count: usize,
+    channels: usize,
+    sums: &'a mut [f64],
+}
+
+impl Leaf for ColumnSums<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        const WIDEST: usize = 16;
+        let ColumnSums {
+            rows,
+            step,
+            count,
+            channels,
+            sums,
+        } = self;
+        assert!(count > 0 && rows.len() >= (count - 1) * step + channels && sums.len() >= channels);
+        for channel in (0..channels).step_by(S::LANES) {
+            let n = S::LANES.min(channels - channel);
+            let mut lanes = [0.0; WIDEST];
+            // SAFETY: `n` channels of every row are there, and `lanes` holds a vector.
+            unsafe {
+                let mut sum = S::zero();
+                for row in 0..count {
+                    sum = S::add(sum, part::<S>(rows.as_ptr().add(row * step + channel), n));
+                }
+                S::store(lanes.as_mut_ptr(), sum);
+            }
+            for (sum, lane) in sums[channel..channel + n].iter_mut().zip(lanes) {
+                *sum += f64::from(lane);
+            }
         }
+    }
+}
+
+/// Adds the sum over `count` rows, `step` values apart, of each channel.
+pub(crate) fn column_sums(
+    isa: Isa,
+    rows: &[f32],
+    step: usize,
+    count: usize,
+    channels: usize,
+    sums: &mut [f64],
+) {
+    // SAFETY: the leaf checks its lengths.
+    unsafe {
+        run(
+            isa,
+            ColumnSums {
+                rows,
+                step,
+                count,
+                channels,
+                sums,
+            },
+        )
     }
 }
 
@@ -254,18 +398,48 @@ impl Leaf for Reduce<'_> {
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let Outer { a, a_step, b, b_step, columns, pixels, .. } = self.outer;
+        let Outer {
+            a,
+            a_step,
+            b,
+            b_step,
+            columns,
+            pixels,
+            ..
+        } = self.outer;
         let rows = self.first + padded_rows(self.count);
-        assert!(pixels > 0 && a.len() >= (pixels - 1) * a_step + rows, "rows of the left operand");
-        assert!(b.len() >= (pixels - 1) * b_step + columns.next_multiple_of(S::LANES), "rows of the right operand");
+        assert!(
+            pixels > 0 && a.len() >= (pixels - 1) * a_step + rows,
+            "rows of the left operand"
+        );
+        assert!(
+            b.len() >= (pixels - 1) * b_step + columns.next_multiple_of(S::LANES),
+            "rows of the right operand"
+        );
         for pixel in (0..pixels).step_by(STRETCH) {
             let depth = STRETCH.min(pixels - pixel);
             // SAFETY: just checked; rows of `c` from `first` are this leaf's, padded.
             unsafe {
-                let left = Left { start: a.as_ptr().add(pixel * a_step + self.first), row_step: 1, k_step: a_step };
-                let right = Right::Rows { start: b.as_ptr().add(pixel * b_step), step: b_step };
+                let left = Left {
+                    start: a.as_ptr().add(pixel * a_step + self.first),
+                    row_step: 1,
+                    k_step: a_step,
+                };
+                let right = Right::Rows {
+                    start: b.as_ptr().add(pixel * b_step),
+                    step: b_step,
+                };
                 let c = self.c.pointer().add(self.first * self.c_step);
-                product::<S>(self.count, depth, columns, left, right, c, self.c_step, pixel > 0);
+                product::<S>(
+                    self.count,
+                    depth,
+                    columns,
+                    left,
+                    right,
+                    c,
+                    self.c_step,
+                    pixel > 0,
+                );
             }
         }
     }
@@ -278,7 +452,10 @@ const TASK_ROWS: usize = 48;
 ///
 /// `a` needs 24 values beyond its last row.
 pub(crate) fn outer(isa: Isa, outers: &[Outer], c_step: usize) -> Scratch {
-    let sizes: Vec<usize> = outers.iter().map(|outer| padded_rows(outer.rows) * c_step).collect();
+    let sizes: Vec<usize> = outers
+        .iter()
+        .map(|outer| padded_rows(outer.rows) * c_step)
+        .collect();
     let mut c = Scratch::take(sizes.iter().sum());
     let shared = Shared::new(&mut c);
     let mut tasks = Vec::new();
@@ -293,7 +470,18 @@ pub(crate) fn outer(isa: Isa, outers: &[Outer], c_step: usize) -> Scratch {
     }
     tasks.into_par_iter().for_each(|(outer, first, count, c)| {
         // SAFETY: tasks write different rows: 48 is a multiple of every block of rows, and the last is padded.
-        unsafe { run(isa, Reduce { outer, first, count, c, c_step }) }
+        unsafe {
+            run(
+                isa,
+                Reduce {
+                    outer,
+                    first,
+                    count,
+                    c,
+                    c_step,
+                },
+            )
+        }
     });
     c
 }
@@ -315,7 +503,10 @@ impl<'a> Window<'a> {
         }
         let mut copy = Scratch::zeroed(needed);
         copy[..count * step].copy_from_slice(&slice[..count * step]);
-        Window { slice, copy: Some(copy) }
+        Window {
+            slice,
+            copy: Some(copy),
+        }
     }
 
     pub(crate) fn rows(&self) -> &[f32] {

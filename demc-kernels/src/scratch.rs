@@ -52,7 +52,9 @@ impl Scratch {
 impl Drop for Scratch {
     fn drop(&mut self) {
         let lines = std::mem::take(&mut self.lines);
-        POOL.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).push(lines);
+        POOL.lock()
+            .unwrap_or_else(|poisoned| poisoned.into_inner())
+            .push(lines);
     }
 }
 

@@ -6,9 +6,20 @@ use crate::Grid;
 pub(crate) fn grids() -> Vec<Grid> {
     let sizes = match cfg!(miri) {
         true => vec![(1, 1, 1), (2, 3, 5)],
-        false => vec![(1, 1, 1), (1, 1, 7), (3, 5, 1), (2, 7, 9), (1, 32, 32), (3, 2, 2)],
+        false => vec![
+            (1, 1, 1),
+            (1, 1, 7),
+            (3, 5, 1),
+            (2, 7, 9),
+            (1, 32, 32),
+            (3, 2, 2),
+        ],
     };
-    let grids = sizes.into_iter().map(|(batch, height, width)| Grid { batch, height, width });
+    let grids = sizes.into_iter().map(|(batch, height, width)| Grid {
+        batch,
+        height,
+        width,
+    });
     grids.collect()
 }
 
@@ -32,7 +43,10 @@ pub(crate) fn assert_within(name: &str, found: &[f32], expected: &[f64], bound: 
     let scale = expected.iter().fold(1.0, |m: f64, x| m.max(x.abs()));
     for (i, (f, e)) in found.iter().zip(expected).enumerate() {
         let error = (f64::from(*f) - e).abs() / scale;
-        assert!(error <= bound, "{name}[{i}]: {f} instead of {e}, off by {error:e} of {scale}");
+        assert!(
+            error <= bound,
+            "{name}[{i}]: {f} instead of {e}, off by {error:e} of {scale}"
+        );
     }
 }
 
@@ -48,7 +62,10 @@ pub(crate) fn same_on_any_number_of_threads<R: PartialEq + Send>(work: impl Fn()
         pool.expect("threads").install(&work)
     };
     let one = on(1);
-    assert!(one == on(2) && one == on(3), "results differ with the threads");
+    assert!(
+        one == on(2) && one == on(3),
+        "results differ with the threads"
+    );
 }
 
 /// Bits of values, to compare them NaN and all.

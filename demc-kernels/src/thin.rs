@@ -27,8 +27,20 @@ impl Axes {
     /// As the convolution reads them, or (`transposed`) its gradient by the input.
     pub(crate) fn new(outputs: usize, inputs: usize, transposed: bool) -> Self {
         match transposed {
-            false => Axes { inputs, outputs, input_step: 9, output_step: 9 * inputs, flipped: false },
-            true => Axes { inputs: outputs, outputs: inputs, input_step: 9 * inputs, output_step: 9, flipped: true },
+            false => Axes {
+                inputs,
+                outputs,
+                input_step: 9,
+                output_step: 9 * inputs,
+                flipped: false,
+            },
+            true => Axes {
+                inputs: outputs,
+                outputs: inputs,
+                input_step: 9 * inputs,
+                output_step: 9,
+                flipped: true,
+            },
         }
     }
 
@@ -47,7 +59,9 @@ const MOST_COLLECTED: usize = 36;
 fn neighbour(grid: Grid, row: usize, column: usize, tap: usize) -> Option<isize> {
     let (y, x) = (row + tap / 3, column + tap % 3);
     let there = y >= 1 && y <= grid.height && x >= 1 && x <= grid.width;
-    there.then(|| (tap / 3) as isize * grid.width as isize + (tap % 3) as isize - grid.width as isize - 1)
+    there.then(|| {
+        (tap / 3) as isize * grid.width as isize + (tap % 3) as isize - grid.width as isize - 1
+    })
 }
 
 /// Row and column of a pixel in its image.
@@ -80,10 +94,23 @@ impl Leaf for Gather<'_> {
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let Gather { source, grid, pixels, mirrored, rows, step } = self;
+        let Gather {
+            source,
+            grid,
+            pixels,
+            mirrored,
+            rows,
+            step,
+        } = self;
         let channels = source.channels;
-        assert!(rows.len() >= pixels.len() * step && step >= 9 * channels, "room for the neighbourhoods");
-        assert!(pixels.end * channels <= source.map.len(), "pixels of the map");
+        assert!(
+            rows.len() >= pixels.len() * step && step >= 9 * channels,
+            "room for the neighbourhoods"
+        );
+        assert!(
+            pixels.end * channels <= source.map.len(),
+            "pixels of the map"
+        );
         for (pixel, row) in pixels.zip(rows.chunks_exact_mut(step)) {
             let (y, x) = place(grid, pixel);
             let inside = y > 0 && y + 1 < grid.height && x > 0 && x + 1 < grid.width;
@@ -92,7 +119,9 @@ impl Leaf for Gather<'_> {
                 for line in 0..3 {
                     let first = (pixel + line * grid.width - grid.width - 1) * channels;
                     // SAFETY: the pixel's eight neighbours lie in the image.
-                    unsafe { copy_part::<S>(source, first, &mut row[line * 3 * channels..], 3 * channels) };
+                    unsafe {
+                        copy_part::<S>(source, first, &mut row[line * 3 * channels..], 3 * channels)
+                    };
                 }
                 continue;
             }
@@ -133,9 +162,27 @@ unsafe fn copy_part<S: Simd>(source: Source, first: usize, to: &mut [f32], count
 
 impl Source<'_> {
     /// See [`Gather`].
-    fn gather(&self, isa: Isa, grid: Grid, pixels: std::ops::Range<usize>, mirrored: bool, rows: &mut [f32], step: usize) {
-        assert!(self.gate.is_none_or(|gate| gate.len() == self.map.len()), "a gate of the map's size");
-        let leaf = Gather { source: *self, grid, pixels, mirrored, rows, step };
+    fn gather(
+        &self,
+        isa: Isa,
+        grid: Grid,
+        pixels: std::ops::Range<usize>,
+        mirrored: bool,
+        rows: &mut [f32],
+        step: usize,
+    ) {
+        assert!(
+            self.gate.is_none_or(|gate| gate.len() == self.map.len()),
+            "a gate of the map's size"
+        );
+        let leaf = Gather {
+            source: *self,
+            grid,
+            pixels,
+            mirrored,
+            rows,
+            step,
+        };
         // SAFETY: the leaf checks its lengths, the gate's was checked.
         unsafe { run(isa, leaf) }
     }
@@ -143,10 +190,20 @@ impl Source<'_> {
     /// Some pixels themselves as rows, `step` values apart.
     fn copy(&self, isa: Isa, pixels: std::ops::Range<usize>, rows: &mut [f32], step: usize) {
         let (first, channels) = (pixels.start * self.channels, self.channels);
-        copy(isa, Copy {
-            from: &self.map[first..], from_step: channels, gate: self.gate.map(|gate| &gate[first..]),
-            bias: None, relu: false, to: rows, to_step: step, rows: pixels.len(), channels,
-        });
+        copy(
+            isa,
+            Copy {
+                from: &self.map[first..],
+                from_step: channels,
+                gate: self.gate.map(|gate| &gate[first..]),
+                bias: None,
+                relu: false,
+                to: rows,
+                to_step: step,
+                rows: pixels.len(),
+                channels,
+            },
+        );
     }
 }
 
@@ -167,10 +224,21 @@ pub(crate) fn convolve(
     finish: Finish,
     y: &mut [f32],
 ) {
-    let source = Source { map: x, gate, channels: axes.inputs };
+    let source = Source {
+        map: x,
+        gate,
+        channels: axes.inputs,
+    };
     let height = y.len() / (grid.batch * grid.width * axes.outputs);
-    assert!(above + height <= grid.height, "rows {above} to {} of {grid:?}", above + height);
-    assert!(grid.batch == 1 || height == grid.height, "a band of a single image");
+    assert!(
+        above + height <= grid.height,
+        "rows {above} to {} of {grid:?}",
+        above + height
+    );
+    assert!(
+        grid.batch == 1 || height == grid.height,
+        "a band of a single image"
+    );
     if 9 * axes.outputs <= MOST_COLLECTED && axes.inputs > axes.outputs {
         collect(isa, grid, source, above, weight, axes, finish, y);
     } else {
@@ -195,18 +263,47 @@ fn spread(
         weight[axes.place(k % axes.inputs, column, k / axes.inputs)]
     });
     let wide = whole(columns);
-    y.par_chunks_mut(BLOCK * columns).enumerate().for_each(|(task, y)| {
-        let (first, count) = (task * BLOCK, y.len() / columns);
-        let mut a = Scratch::take(padded_rows(count) * depth);
-        let mut c = Scratch::take(padded_rows(count) * wide);
-        let skipped = above * grid.width;
-        source.gather(isa, grid, skipped + first..skipped + first + count, false, &mut a, depth);
-        rows::sum(isa, count, &[Term { rows: &a, step: depth, weight: &b }], &mut c, wide);
-        copy(isa, Copy {
-            from: &c, from_step: wide, gate: None, bias: finish.bias, relu: finish.relu,
-            to: y, to_step: columns, rows: count, channels: columns,
+    y.par_chunks_mut(BLOCK * columns)
+        .enumerate()
+        .for_each(|(task, y)| {
+            let (first, count) = (task * BLOCK, y.len() / columns);
+            let mut a = Scratch::take(padded_rows(count) * depth);
+            let mut c = Scratch::take(padded_rows(count) * wide);
+            let skipped = above * grid.width;
+            source.gather(
+                isa,
+                grid,
+                skipped + first..skipped + first + count,
+                false,
+                &mut a,
+                depth,
+            );
+            rows::sum(
+                isa,
+                count,
+                &[Term {
+                    rows: &a,
+                    step: depth,
+                    weight: &b,
+                }],
+                &mut c,
+                wide,
+            );
+            copy(
+                isa,
+                Copy {
+                    from: &c,
+                    from_step: wide,
+                    gate: None,
+                    bias: finish.bias,
+                    relu: finish.relu,
+                    to: y,
+                    to_step: columns,
+                    rows: count,
+                    channels: columns,
+                },
+            );
         });
-    });
 }
 
 /// By the values that a pixel gives to its neighbours.
@@ -232,18 +329,47 @@ fn collect(
     let mut given = Scratch::take((image.next_multiple_of(BLOCK) + BLOCK) * wide);
     let rows = y.len() / grid.batch;
     for (index, y) in y.chunks_mut(rows).enumerate() {
-        given.par_chunks_mut(BLOCK * wide).take(image.div_ceil(BLOCK)).enumerate().for_each(|(task, c)| {
-            let first = task * BLOCK;
-            let count = BLOCK.min(image - first);
-            let mut a = Scratch::take(padded_rows(count) * depth);
-            source.copy(isa, index * image + first..index * image + first + count, &mut a, depth);
-            rows::sum(isa, count, &[Term { rows: &a, step: depth, weight: &b }], c, wide);
-        });
-        y.par_chunks_mut(grid.width * outputs).enumerate().for_each(|(row, y)| {
-            let leaf = Collect { grid, given: &given, wide, finish, row: above + row, outputs, y };
-            // SAFETY: the leaf checks its lengths.
-            unsafe { run(isa, leaf) }
-        });
+        given
+            .par_chunks_mut(BLOCK * wide)
+            .take(image.div_ceil(BLOCK))
+            .enumerate()
+            .for_each(|(task, c)| {
+                let first = task * BLOCK;
+                let count = BLOCK.min(image - first);
+                let mut a = Scratch::take(padded_rows(count) * depth);
+                source.copy(
+                    isa,
+                    index * image + first..index * image + first + count,
+                    &mut a,
+                    depth,
+                );
+                rows::sum(
+                    isa,
+                    count,
+                    &[Term {
+                        rows: &a,
+                        step: depth,
+                        weight: &b,
+                    }],
+                    c,
+                    wide,
+                );
+            });
+        y.par_chunks_mut(grid.width * outputs)
+            .enumerate()
+            .for_each(|(row, y)| {
+                let leaf = Collect {
+                    grid,
+                    given: &given,
+                    wide,
+                    finish,
+                    row: above + row,
+                    outputs,
+                    y,
+                };
+                // SAFETY: the leaf checks its lengths.
+                unsafe { run(isa, leaf) }
+            });
     }
 }
 
@@ -263,7 +389,15 @@ impl Leaf for Collect<'_> {
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let Collect { grid, given, wide, finish, row, outputs, y } = self;
+        let Collect {
+            grid,
+            given,
+            wide,
+            finish,
+            row,
+            outputs,
+            y,
+        } = self;
         assert!(y.len() == grid.width * outputs && row < grid.height);
         assert!(given.len() >= grid.height * grid.width * wide && wide >= 9 * outputs);
         for (column, y) in y.chunks_exact_mut(outputs).enumerate() {
@@ -275,7 +409,8 @@ impl Leaf for Collect<'_> {
                     let mut sum = finish.bias::<S>(channel, n);
                     for tap in 0..9 {
                         if let Some(offset) = neighbour(grid, row, column, tap) {
-                            let from = pixel.wrapping_add_signed(offset) * wide + tap * outputs + channel;
+                            let from =
+                                pixel.wrapping_add_signed(offset) * wide + tap * outputs + channel;
                             sum = S::add(sum, S::load_part(given.as_ptr().add(from), n));
                         }
                     }
@@ -301,11 +436,23 @@ pub(crate) fn gradient(
     dbias: &mut [f32],
 ) {
     let (inputs, outputs) = (grid.channels(x.len()), dbias.len());
-    let x = Source { map: x, gate: None, channels: inputs };
-    let dy = Source { map: dy, gate, channels: outputs };
+    let x = Source {
+        map: x,
+        gate: None,
+        channels: inputs,
+    };
+    let dy = Source {
+        map: dy,
+        gate,
+        channels: outputs,
+    };
     // The thin side is the one whose neighbourhoods become rows.
     let by_output = 9 * outputs <= MOST_COLLECTED && inputs > outputs;
-    let (rows, columns) = if by_output { (inputs, 9 * outputs) } else { (9 * inputs, outputs) };
+    let (rows, columns) = if by_output {
+        (inputs, 9 * outputs)
+    } else {
+        (9 * inputs, outputs)
+    };
     // One row more, of ones: its gradient is the sum of `dy`, the bias's.
     let (tall, wide) = (padded_rows(rows + 1), whole(columns));
     let pixels = grid.pixels();
@@ -313,30 +460,45 @@ pub(crate) fn gradient(
     let stretches = pixels.div_ceil(stretch);
     let size = tall * wide;
     let mut sums = Scratch::zeroed(stretches * size);
-    sums.par_chunks_mut(size).enumerate().for_each(|(index, sum)| {
-        let end = ((index + 1) * stretch).min(pixels);
-        let mut a = Scratch::zeroed(BLOCK * tall);
-        a.iter_mut().skip(rows).step_by(tall).for_each(|one| *one = 1.0);
-        let mut b = Scratch::zeroed(BLOCK * wide);
-        for first in (index * stretch..end).step_by(BLOCK) {
-            let range = first..(first + BLOCK).min(end);
-            let count = range.len();
-            if by_output {
-                x.copy(isa, range.clone(), &mut a, tall);
-                dy.gather(isa, grid, range, true, &mut b, wide);
-            } else {
-                x.gather(isa, grid, range.clone(), false, &mut a, tall);
-                dy.copy(isa, range, &mut b, wide);
+    sums.par_chunks_mut(size)
+        .enumerate()
+        .for_each(|(index, sum)| {
+            let end = ((index + 1) * stretch).min(pixels);
+            let mut a = Scratch::zeroed(BLOCK * tall);
+            a.iter_mut()
+                .skip(rows)
+                .step_by(tall)
+                .for_each(|one| *one = 1.0);
+            let mut b = Scratch::zeroed(BLOCK * wide);
+            for first in (index * stretch..end).step_by(BLOCK) {
+                let range = first..(first + BLOCK).min(end);
+                let count = range.len();
+                if by_output {
+                    x.copy(isa, range.clone(), &mut a, tall);
+                    dy.gather(isa, grid, range, true, &mut b, wide);
+                } else {
+                    x.gather(isa, grid, range.clone(), false, &mut a, tall);
+                    dy.copy(isa, range, &mut b, wide);
+                }
+                let leaf = Accumulate {
+                    rows: rows + 1,
+                    pixels: count,
+                    columns,
+                    a: &a,
+                    a_step: tall,
+                    b: &b,
+                    b_step: wide,
+                    c: sum,
+                    c_step: wide,
+                };
+                // SAFETY: lengths are checked within.
+                unsafe { run(isa, leaf) };
             }
-            let leaf = Accumulate {
-                rows: rows + 1, pixels: count, columns, a: &a, a_step: tall, b: &b, b_step: wide, c: sum, c_step: wide,
-            };
-            // SAFETY: lengths are checked within.
-            unsafe { run(isa, leaf) };
-        }
-    });
+        });
     let total = |row: usize, column: usize| -> f32 {
-        (0..stretches).map(|s| sums[s * size + row * wide + column]).sum()
+        (0..stretches)
+            .map(|s| sums[s * size + row * wide + column])
+            .sum()
     };
     for o in 0..outputs {
         for i in 0..inputs {
@@ -372,13 +534,32 @@ impl Leaf for Accumulate<'_> {
     unsafe fn run<S: Simd>(self) {
         let rows = padded_rows(self.rows);
         assert!(self.pixels > 0 && self.a.len() >= (self.pixels - 1) * self.a_step + rows);
-        assert!(self.b.len() >= (self.pixels - 1) * self.b_step + self.columns.next_multiple_of(S::LANES));
+        assert!(
+            self.b.len()
+                >= (self.pixels - 1) * self.b_step + self.columns.next_multiple_of(S::LANES)
+        );
         assert!(self.c.len() >= (rows - 1) * self.c_step + self.columns.next_multiple_of(S::LANES));
         // SAFETY: just checked.
         unsafe {
-            let a = Left { start: self.a.as_ptr(), row_step: 1, k_step: self.a_step };
-            let b = Right::Rows { start: self.b.as_ptr(), step: self.b_step };
-            product::<S>(self.rows, self.pixels, self.columns, a, b, self.c.as_mut_ptr(), self.c_step, true);
+            let a = Left {
+                start: self.a.as_ptr(),
+                row_step: 1,
+                k_step: self.a_step,
+            };
+            let b = Right::Rows {
+                start: self.b.as_ptr(),
+                step: self.b_step,
+            };
+            product::<S>(
+                self.rows,
+                self.pixels,
+                self.columns,
+                a,
+                b,
+                self.c.as_mut_ptr(),
+                self.c_step,
+                true,
+            );
         }
     }
 }

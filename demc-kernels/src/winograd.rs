@@ -84,7 +84,10 @@ mod line {
             } else {
                 let (two, four, eight) = (S::splat(2.0), S::splat(4.0), S::splat(8.0));
                 let (even, odd) = (S::add(y[0], y[2]), S::add(y[1], y[3]));
-                let (even2, odd2) = (S::fma(four, y[2], y[0]), S::fma(eight, y[3], S::mul(two, y[1])));
+                let (even2, odd2) = (
+                    S::fma(four, y[2], y[0]),
+                    S::fma(eight, y[3], S::mul(two, y[1])),
+                );
                 m[0] = y[0];
                 m[1] = S::add(even, odd);
                 m[2] = S::sub(even, odd);
@@ -112,7 +115,11 @@ mod line {
             } else {
                 let (sixth, twelfth) = (S::splat(-1.0 / 6.0), S::splat(1.0 / 12.0));
                 let (sum, mid) = (S::mul(sixth, S::add(w[0], w[2])), S::mul(sixth, w[1]));
-                let far = S::fma(S::splat(1.0 / 24.0), w[0], S::mul(S::splat(1.0 / 6.0), w[2]));
+                let far = S::fma(
+                    S::splat(1.0 / 24.0),
+                    w[0],
+                    S::mul(S::splat(1.0 / 6.0), w[2]),
+                );
                 let mid2 = S::mul(twelfth, w[1]);
                 u[0] = S::mul(S::splat(0.25), w[0]);
                 u[1] = S::add(sum, mid);
@@ -141,7 +148,10 @@ mod line {
                 let (sixth, twelfth) = (S::splat(1.0 / 6.0), S::splat(1.0 / 12.0));
                 let (s2, d2) = (S::add(u[3], u[4]), S::sub(u[3], u[4]));
                 let near = S::mul(sixth, s1);
-                w[0] = S::sub(S::fma(S::splat(0.25), u[0], S::mul(S::splat(1.0 / 24.0), s2)), near);
+                w[0] = S::sub(
+                    S::fma(S::splat(0.25), u[0], S::mul(S::splat(1.0 / 24.0), s2)),
+                    near,
+                );
                 w[1] = S::sub(S::mul(twelfth, d2), S::mul(sixth, d1));
                 w[2] = S::add(S::sub(S::mul(sixth, s2), near), u[5]);
             }
@@ -172,11 +182,17 @@ macro_rules! both {
         let mut values = $d;
         each!(c < $n, {
             let mut column: [<$s>::V; $n] = [values[0][c]; $n];
-            each!(r < $n, { column[r] = values[r][c]; });
+            each!(r < $n, {
+                column[r] = values[r][c];
+            });
             let column = $f(column);
-            each!(r < $n, { values[r][c] = column[r]; });
+            each!(r < $n, {
+                values[r][c] = column[r];
+            });
         });
-        each!(r < $n, { values[r] = $f(values[r]); });
+        each!(r < $n, {
+            values[r] = $f(values[r]);
+        });
         values
     }};
 }
@@ -204,7 +220,14 @@ impl Tiles {
     fn of_rows(input: Grid, above: usize, height: usize, out: usize) -> Self {
         let grid = Grid { height, ..input };
         let (down, across) = (height.div_ceil(out), grid.width.div_ceil(out));
-        Tiles { grid, input, above, out, down, across }
+        Tiles {
+            grid,
+            input,
+            above,
+            out,
+            down,
+            across,
+        }
     }
 
     fn count(self) -> usize {
@@ -213,9 +236,16 @@ impl Tiles {
 
     /// First pixel of the image, row and column of a tile's output.
     fn at(self, tile: usize) -> (usize, usize, usize) {
-        let (image, rest) = (tile / (self.down * self.across), tile % (self.down * self.across));
+        let (image, rest) = (
+            tile / (self.down * self.across),
+            tile % (self.down * self.across),
+        );
         let first = image * self.grid.height * self.grid.width;
-        (first, rest / self.across * self.out, rest % self.across * self.out)
+        (
+            first,
+            rest / self.across * self.out,
+            rest % self.across * self.out,
+        )
     }
 
     /// First pixel of the input's image, row and column there of a tile's input, which begins a row and a column before
@@ -250,8 +280,20 @@ impl Axes {
     /// As the convolution reads them, or its gradient by the input.
     fn new(outputs: usize, inputs: usize, transposed: bool) -> Self {
         match transposed {
-            false => Axes { depth: inputs, columns: outputs, depth_step: 9, column_step: 9 * inputs, flipped: false },
-            true => Axes { depth: outputs, columns: inputs, depth_step: 9 * inputs, column_step: 9, flipped: true },
+            false => Axes {
+                depth: inputs,
+                columns: outputs,
+                depth_step: 9,
+                column_step: 9 * inputs,
+                flipped: false,
+            },
+            true => Axes {
+                depth: outputs,
+                columns: inputs,
+                depth_step: 9 * inputs,
+                column_step: 9,
+                flipped: true,
+            },
         }
     }
 
@@ -293,7 +335,10 @@ impl<const IN: usize> Leaf for Pack<'_, IN> {
                         w[tap / 3][tap % 3] = S::load(lanes.as_ptr());
                     }
                     let u = both!(line::weight::<S, IN>, S, IN, w);
-                    let to = self.to.pointer().add(panels.place(self.axes.depth, k, first));
+                    let to = self
+                        .to
+                        .pointer()
+                        .add(panels.place(self.axes.depth, k, first));
                     for place in 0..IN * IN {
                         S::store(to.add(place * self.place_step), u[place / IN][place % IN]);
                     }
@@ -339,13 +384,27 @@ impl Weights {
         let mut values = Scratch::take(IN * IN * place_step);
         let to = Shared::new(&mut values);
         let step = (8192 / axes.columns).max(1);
-        (0..axes.depth.div_ceil(step)).into_par_iter().for_each(|task| {
-            let rows = task * step..((task + 1) * step).min(axes.depth);
-            let leaf = Pack::<IN> { weight, axes, rows, to, place_step };
-            // SAFETY: tasks write different rows, all of them within `values`.
-            unsafe { run(isa, leaf) }
-        });
-        Weights { isa, depth: axes.depth, columns: axes.columns, place_step, values }
+        (0..axes.depth.div_ceil(step))
+            .into_par_iter()
+            .for_each(|task| {
+                let rows = task * step..((task + 1) * step).min(axes.depth);
+                let leaf = Pack::<IN> {
+                    weight,
+                    axes,
+                    rows,
+                    to,
+                    place_step,
+                };
+                // SAFETY: tasks write different rows, all of them within `values`.
+                unsafe { run(isa, leaf) }
+            });
+        Weights {
+            isa,
+            depth: axes.depth,
+            columns: axes.columns,
+            place_step,
+            values,
+        }
     }
 }
 
@@ -380,13 +439,16 @@ impl Source<'_> {
         unsafe {
             let mut d = [[S::zero(); IN]; IN];
             if inside && n == S::LANES {
-                let first = (image + row as usize * grid.width + column as usize) * self.channels + channel;
+                let first =
+                    (image + row as usize * grid.width + column as usize) * self.channels + channel;
                 let line = grid.width * self.channels;
                 let map = self.map.as_ptr().add(first);
                 match self.gate {
                     None => each!(r < SIZE, {
                         let map = map.add(r * line);
-                        each!(c < SIZE, { d[r][c] = S::load(map.add(c * self.channels)); });
+                        each!(c < SIZE, {
+                            d[r][c] = S::load(map.add(c * self.channels));
+                        });
                     }),
                     Some(gate) => {
                         let gate = gate.as_ptr().add(first);
@@ -400,17 +462,23 @@ impl Source<'_> {
                     }
                 }
             } else {
+                #[allow(clippy::needless_range_loop, reason = "two arrays' worth of indices")]
                 for r in 0..SIZE {
                     for c in 0..SIZE {
                         let (y, x) = (row + r as isize, column + c as isize);
-                        let there = y >= 0 && x >= 0 && (y as usize) < grid.height && (x as usize) < grid.width;
+                        let there = y >= 0
+                            && x >= 0
+                            && (y as usize) < grid.height
+                            && (x as usize) < grid.width;
                         if there {
                             let pixel = image + y as usize * grid.width + x as usize;
                             let at = pixel * self.channels + channel;
                             let value = S::load_part(self.map.as_ptr().add(at), n);
                             d[r][c] = match self.gate {
                                 None => value,
-                                Some(gate) => S::gate(value, S::load_part(gate.as_ptr().add(at), n)),
+                                Some(gate) => {
+                                    S::gate(value, S::load_part(gate.as_ptr().add(at), n))
+                                }
                             };
                         }
                     }
@@ -435,13 +503,20 @@ impl Space {
     /// # Safety
     /// The machine has the path of `S`, and the tile is the caller's to write.
     #[inline(always)]
-    unsafe fn store<S: Simd, const IN: usize>(self, tile: usize, channel: usize, v: [[S::V; IN]; IN]) {
+    unsafe fn store<S: Simd, const IN: usize>(
+        self,
+        tile: usize,
+        channel: usize,
+        v: [[S::V; IN]; IN],
+    ) {
         // SAFETY: the caller's.
         unsafe {
             let to = self.start.add(tile * self.tile_step + channel);
             each!(r < IN, {
                 let to = to.add(r * IN * self.place_step);
-                each!(c < IN, { S::store(to.add(c * self.place_step), v[r][c]); });
+                each!(c < IN, {
+                    S::store(to.add(c * self.place_step), v[r][c]);
+                });
             });
         }
     }
@@ -451,14 +526,20 @@ impl Space {
     /// # Safety
     /// As for `store`, to read.
     #[inline(always)]
-    unsafe fn load<S: Simd, const IN: usize>(self, tile: usize, channel: usize) -> [[S::V; IN]; IN] {
+    unsafe fn load<S: Simd, const IN: usize>(
+        self,
+        tile: usize,
+        channel: usize,
+    ) -> [[S::V; IN]; IN] {
         // SAFETY: the caller's.
         unsafe {
             let from = self.start.add(tile * self.tile_step + channel);
             let mut v = [[S::zero(); IN]; IN];
             each!(r < IN, {
                 let from = from.add(r * IN * self.place_step);
-                each!(c < IN, { v[r][c] = S::load(from.add(c * self.place_step)); });
+                each!(c < IN, {
+                    v[r][c] = S::load(from.add(c * self.place_step));
+                });
             });
             v
         }
@@ -525,7 +606,14 @@ impl<const IN: usize> Leaf for Block<'_, IN> {
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let Block { source, weights, finish, tiles, range, y } = self;
+        let Block {
+            source,
+            weights,
+            finish,
+            tiles,
+            range,
+            y,
+        } = self;
         let (depth, columns, out) = (weights.depth, weights.columns, IN - 2);
         let (count, rows) = (range.len(), padded_rows(range.len()));
         let space = |scratch: &mut Scratch, channels: usize| Space {
@@ -533,7 +621,10 @@ impl<const IN: usize> Leaf for Block<'_, IN> {
             place_step: place_step(rows * channels),
             tile_step: channels,
         };
-        let (wide, tall) = (columns.next_multiple_of(S::LANES), depth.next_multiple_of(S::LANES));
+        let (wide, tall) = (
+            columns.next_multiple_of(S::LANES),
+            depth.next_multiple_of(S::LANES),
+        );
         let mut input = Scratch::take(IN * IN * place_step(rows * tall));
         let mut output = Scratch::take(IN * IN * place_step(rows * wide));
         let (v, m) = (space(&mut input, tall), space(&mut output, wide));
@@ -541,7 +632,11 @@ impl<const IN: usize> Leaf for Block<'_, IN> {
         unsafe {
             take_input::<S, IN>(source, tiles, range.clone(), v);
             for place in 0..IN * IN {
-                let a = Left { start: v.start.add(place * v.place_step), row_step: tall, k_step: 1 };
+                let a = Left {
+                    start: v.start.add(place * v.place_step),
+                    row_step: tall,
+                    k_step: 1,
+                };
                 let b = Right::Packed(weights.values.as_ptr().add(place * weights.place_step));
                 let c = m.start.add(place * m.place_step);
                 product::<S>(count, depth, columns, a, b, c, wide, false);
@@ -550,11 +645,18 @@ impl<const IN: usize> Leaf for Block<'_, IN> {
                 let (image, row, column) = tiles.at(tile);
                 let whole = row + out <= tiles.grid.height && column + out <= tiles.grid.width;
                 let line = tiles.grid.width * columns;
-                let to = y.pointer().add((image + row * tiles.grid.width + column) * columns);
+                let to = y
+                    .pointer()
+                    .add((image + row * tiles.grid.width + column) * columns);
                 for channel in (0..columns).step_by(S::LANES) {
                     let n = S::LANES.min(columns - channel);
                     let bias = finish.bias::<S>(channel, n);
-                    let mut result = both!(line::output::<S, IN>, S, IN, m.load::<S, IN>(index, channel));
+                    let mut result = both!(
+                        line::output::<S, IN>,
+                        S,
+                        IN,
+                        m.load::<S, IN>(index, channel)
+                    );
                     each!(r < out, {
                         each!(c < out, {
                             let value = S::add(result[r][c], bias);
@@ -564,11 +666,19 @@ impl<const IN: usize> Leaf for Block<'_, IN> {
                     let to = to.add(channel);
                     if whole && n == S::LANES {
                         each!(r < out, {
-                            each!(c < out, { S::store(to.add(r * line + c * columns), result[r][c]); });
+                            each!(c < out, {
+                                S::store(to.add(r * line + c * columns), result[r][c]);
+                            });
                         });
                     } else {
-                        for (r, result) in result[..out.min(tiles.grid.height - row)].iter().enumerate() {
-                            for (c, value) in result[..out.min(tiles.grid.width - column)].iter().enumerate() {
+                        for (r, result) in result[..out.min(tiles.grid.height - row)]
+                            .iter()
+                            .enumerate()
+                        {
+                            for (c, value) in result[..out.min(tiles.grid.width - column)]
+                                .iter()
+                                .enumerate()
+                            {
                                 S::store_part(to.add(r * line + c * columns), n, *value);
                             }
                         }
@@ -591,7 +701,11 @@ const FEWEST_TILES: usize = 48;
 /// Tiles of a block, for as many blocks as keeps all threads at work.
 fn block_tiles(tiles: usize, values_per_tile: usize, weights: usize) -> usize {
     // Where the weights fall out of the second-level cache, more tiles use them while they are there.
-    let fewest = if weights > 4 * BLOCK_VALUES { MOST_TILES / 2 } else { FEWEST_TILES };
+    let fewest = if weights > 4 * BLOCK_VALUES {
+        MOST_TILES / 2
+    } else {
+        FEWEST_TILES
+    };
     let most = (BLOCK_VALUES / values_per_tile).clamp(fewest, MOST_TILES);
     let threads = rayon::current_num_threads();
     let blocks = tiles.div_ceil(most).next_multiple_of(threads);
@@ -628,20 +742,53 @@ pub(crate) fn convolve_rows<const IN: usize>(
 ) {
     let (depth, columns) = (weights.depth, weights.columns);
     let height = y.len() / (grid.batch * grid.width * columns);
-    assert_eq!(x.len(), grid.pixels() * depth, "a map of {depth} channels on {grid:?}");
-    assert_eq!(y.len(), grid.batch * height * grid.width * columns, "a map of {columns} channels on {grid:?}");
-    assert!(above + height <= grid.height, "rows {above} to {} of {grid:?}", above + height);
-    assert!(gate.is_none_or(|gate| gate.len() == x.len()), "the gate of a map of {} values", x.len());
-    let source = Source { map: x, gate, channels: depth };
+    assert_eq!(
+        x.len(),
+        grid.pixels() * depth,
+        "a map of {depth} channels on {grid:?}"
+    );
+    assert_eq!(
+        y.len(),
+        grid.batch * height * grid.width * columns,
+        "a map of {columns} channels on {grid:?}"
+    );
+    assert!(
+        above + height <= grid.height,
+        "rows {above} to {} of {grid:?}",
+        above + height
+    );
+    assert!(
+        gate.is_none_or(|gate| gate.len() == x.len()),
+        "the gate of a map of {} values",
+        x.len()
+    );
+    let source = Source {
+        map: x,
+        gate,
+        channels: depth,
+    };
     let tiles = Tiles::of_rows(grid, above, height, IN - 2);
-    let step = block_tiles(tiles.count(), IN * IN * (depth + columns), weights.values.len());
+    let step = block_tiles(
+        tiles.count(),
+        IN * IN * (depth + columns),
+        weights.values.len(),
+    );
     let y = Shared::new(y);
-    (0..tiles.count().div_ceil(step)).into_par_iter().for_each(|task| {
-        let range = task * step..((task + 1) * step).min(tiles.count());
-        let leaf = Block::<IN> { source, weights, finish, tiles, range, y };
-        // SAFETY: every tile of `y` is written by one task; `source` and the weights have the lengths checked above.
-        unsafe { run(weights.isa, leaf) }
-    });
+    (0..tiles.count().div_ceil(step))
+        .into_par_iter()
+        .for_each(|task| {
+            let range = task * step..((task + 1) * step).min(tiles.count());
+            let leaf = Block::<IN> {
+                source,
+                weights,
+                finish,
+                tiles,
+                range,
+                y,
+            };
+            // SAFETY: every tile of `y` is written by one task; `source` and the weights have the lengths checked above.
+            unsafe { run(weights.isa, leaf) }
+        });
 }
 
 /// Transforms of some tiles for the weights' gradient: `B^T x B` and `A dy A^T`, and the sum of `dy`.
@@ -681,13 +828,19 @@ impl<const IN: usize> Leaf for Taken<'_, IN> {
                 let (row, column) = (row as isize, column as isize);
                 for channel in (0..self.dy.channels).step_by(S::LANES) {
                     let d = match IN {
-                        4 => self.dy.tile::<S, IN, 2>(self.tiles.grid, image, row, column, channel),
-                        _ => self.dy.tile::<S, IN, 4>(self.tiles.grid, image, row, column, channel),
+                        4 => self
+                            .dy
+                            .tile::<S, IN, 2>(self.tiles.grid, image, row, column, channel),
+                        _ => self
+                            .dy
+                            .tile::<S, IN, 4>(self.tiles.grid, image, row, column, channel),
                     };
                     let to = self.dbias.pointer().add(channel);
                     let mut sum = S::load(to);
                     each!(r < IN - 2, {
-                        each!(c < IN - 2, { sum = S::add(sum, d[r][c]); });
+                        each!(c < IN - 2, {
+                            sum = S::add(sum, d[r][c]);
+                        });
                     });
                     S::store(to, sum);
                     let m = both!(line::output_transposed::<S, IN>, S, IN, d);
@@ -718,9 +871,25 @@ impl Leaf for Accumulate {
     unsafe fn run<S: Simd>(self) {
         // SAFETY: the caller's: buffers with the padding that a product asks for.
         unsafe {
-            let a = Left { start: self.a.pointer(), row_step: 1, k_step: self.a_step };
-            let b = Right::Rows { start: self.b.pointer(), step: self.b_step };
-            product::<S>(self.rows, self.depth, self.columns, a, b, self.c.pointer(), self.c_step, true);
+            let a = Left {
+                start: self.a.pointer(),
+                row_step: 1,
+                k_step: self.a_step,
+            };
+            let b = Right::Rows {
+                start: self.b.pointer(),
+                step: self.b_step,
+            };
+            product::<S>(
+                self.rows,
+                self.depth,
+                self.columns,
+                a,
+                b,
+                self.c.pointer(),
+                self.c_step,
+                true,
+            );
         }
     }
 }
@@ -757,7 +926,8 @@ impl<const IN: usize> Leaf for Unpack<'_, IN> {
                     }
                     for lane in 0..S::LANES.min(self.axes.columns - first) {
                         for (tap, lanes) in taps.iter().enumerate() {
-                            *self.to.pointer().add(self.axes.place(k, first + lane, tap)) = lanes[lane];
+                            *self.to.pointer().add(self.axes.place(k, first + lane, tap)) =
+                                lanes[lane];
                         }
                     }
                 }
@@ -784,16 +954,34 @@ pub(crate) fn gradient<const IN: usize>(
     dbias: &mut [f32],
 ) {
     let (inputs, outputs) = (grid.channels(x.len()), grid.channels(dy.len()));
-    assert_eq!(dweight.len(), outputs * inputs * 9, "a weight of {inputs} to {outputs} channels");
+    assert_eq!(
+        dweight.len(),
+        outputs * inputs * 9,
+        "a weight of {inputs} to {outputs} channels"
+    );
     assert_eq!(dbias.len(), outputs, "a bias of {outputs} channels");
-    assert!(gate.is_none_or(|gate| gate.len() == dy.len()), "the gate of a map of {} values", dy.len());
+    assert!(
+        gate.is_none_or(|gate| gate.len() == dy.len()),
+        "the gate of a map of {} values",
+        dy.len()
+    );
     let (source, dy) = (
-        Source { map: x, gate: None, channels: inputs },
-        Source { map: dy, gate, channels: outputs },
+        Source {
+            map: x,
+            gate: None,
+            channels: inputs,
+        },
+        Source {
+            map: dy,
+            gate,
+            channels: outputs,
+        },
     );
     let tiles = Tiles::new(grid, IN - 2);
     let (tall, wide) = (padded(isa, inputs), padded(isa, outputs));
-    let chunk = (CHUNK_VALUES / (IN * IN * (tall + wide))).next_multiple_of(TASK_TILES).max(TASK_TILES);
+    let chunk = (CHUNK_VALUES / (IN * IN * (tall + wide)))
+        .next_multiple_of(TASK_TILES)
+        .max(TASK_TILES);
     let chunk = chunk.min(tiles.count().next_multiple_of(TASK_TILES));
     let (v_step, z_step) = (place_step(chunk * tall + 32), place_step(chunk * wide));
     let mut v = Scratch::take(IN * IN * v_step);
@@ -803,26 +991,33 @@ pub(crate) fn gradient<const IN: usize>(
     let mut u = Scratch::zeroed(IN * IN * u_step);
     let tasks = tiles.count().div_ceil(TASK_TILES);
     let mut sums = Scratch::take(tasks * wide);
-    let (v, z, u_shared, sums_shared) = (Shared::new(&mut v), Shared::new(&mut z), Shared::new(&mut u), Shared::new(&mut sums));
+    let (v, z, u_shared, sums_shared) = (
+        Shared::new(&mut v),
+        Shared::new(&mut z),
+        Shared::new(&mut u),
+        Shared::new(&mut sums),
+    );
     // Rows of the gradient a task: whole row blocks, so that tasks write nothing in common.
     let row_task = if rows >= 96 { 48 } else { rows };
     for first in (0..tiles.count()).step_by(chunk) {
         let count = chunk.min(tiles.count() - first);
-        (0..count.div_ceil(TASK_TILES)).into_par_iter().for_each(|task| {
-            let index = task * TASK_TILES;
-            let leaf = Taken::<IN> {
-                x: source,
-                dy,
-                tiles,
-                range: first + index..first + (index + TASK_TILES).min(count),
-                index,
-                v: (v, v_step, tall),
-                z: (z, z_step, wide),
-                dbias: sums_shared.offset(((first + index) / TASK_TILES) * wide),
-            };
-            // SAFETY: every tile of the chunk and every stretch of `sums` is written by one task.
-            unsafe { run(isa, leaf) }
-        });
+        (0..count.div_ceil(TASK_TILES))
+            .into_par_iter()
+            .for_each(|task| {
+                let index = task * TASK_TILES;
+                let leaf = Taken::<IN> {
+                    x: source,
+                    dy,
+                    tiles,
+                    range: first + index..first + (index + TASK_TILES).min(count),
+                    index,
+                    v: (v, v_step, tall),
+                    z: (z, z_step, wide),
+                    dbias: sums_shared.offset(((first + index) / TASK_TILES) * wide),
+                };
+                // SAFETY: every tile of the chunk and every stretch of `sums` is written by one task.
+                unsafe { run(isa, leaf) }
+            });
         let row_tasks = rows.div_ceil(row_task);
         (0..IN * IN * row_tasks).into_par_iter().for_each(|task| {
             let (place, row) = (task / row_tasks, task % row_tasks * row_task);
