@@ -114,6 +114,11 @@ impl<'a> Ready<'a> {
         }
     }
 
+    /// Input channels.
+    pub fn inputs(&self) -> usize {
+        self.inputs
+    }
+
     /// Output channels.
     pub fn outputs(&self) -> usize {
         self.outputs

@@ -1,0 +1,173 @@
+//! Maps that come in bands of rows, from top to bottom, so that no whole one has to be there.
+//!
+//! A 3x3 convolution needs a row more than it makes on either side. Instead of computing such rows twice, each stage keeps
+//! the few that the next band needs, and lags behind its input by up to a tile. Bands begin at multiples of a tile's rows,
+//! so all bits are those of the whole map.
+
+use std::ops::Range;
+
+use demc_kernels::conv3x3::Ready;
+use demc_kernels::{Grid, memory};
+
+/// Rows of the largest tile of a convolution.
+pub(super) const TILE_ROWS: usize = 4;
+
+/// The rows of one image's map that are there.
+pub(super) struct Stream {
+    /// Rows of the whole map.
+    height: usize,
+    width: usize,
+    channels: usize,
+    /// The first row that is there.
+    first: usize,
+    /// How many are.
+    rows: usize,
+    values: Vec<f32>,
+}
+
+impl Stream {
+    /// None yet, with room for `room`.
+    pub(super) fn new(grid: Grid, channels: usize, room: usize) -> Self {
+        let Grid { height, width, .. } = grid;
+        Stream {
+            height,
+            width,
+            channels,
+            first: 0,
+            rows: 0,
+            values: memory::buffer(room.min(height) * width * channels),
+        }
+    }
+
+    /// Back to the top, for the next image.
+    pub(super) fn restart(&mut self) {
+        (self.first, self.rows) = (0, 0);
+    }
+
+    /// The row after the last that is there.
+    fn end(&self) -> usize {
+        self.first + self.rows
+    }
+
+    /// The rows that are there.
+    pub(super) fn range(&self) -> Range<usize> {
+        self.first..self.end()
+    }
+
+    /// `rows` more, for the caller to write.
+    pub(super) fn push(&mut self, rows: usize) -> &mut [f32] {
+        let row = self.width * self.channels;
+        let (from, to) = (self.rows * row, (self.rows + rows) * row);
+        if self.values.len() < to {
+            // The last band of an image brings what all stages before held back.
+            let mut values = memory::buffer(to);
+            values[..from].copy_from_slice(&self.values[..from]);
+            self.values = values;
+        }
+        self.rows += rows;
+        &mut self.values[from..to]
+    }
+
+    /// The last `rows`.
+    pub(super) fn last(&self, rows: usize) -> &[f32] {
+        let row = self.width * self.channels;
+        &self.values[(self.rows - rows) * row..self.rows * row]
+    }
+
+    /// All that are there, and their grid.
+    pub(super) fn all(&self) -> (Grid, &[f32]) {
+        let grid = Grid {
+            batch: 1,
+            height: self.rows,
+            width: self.width,
+        };
+        (grid, self.last(self.rows))
+    }
+
+    /// Forgets the rows above `row`.
+    pub(super) fn forget_above(&mut self, row: usize) {
+        let gone = row.clamp(self.first, self.end()) - self.first;
+        let values = self.width * self.channels;
+        self.values
+            .copy_within(gone * values..self.rows * values, 0);
+        (self.first, self.rows) = (self.first + gone, self.rows - gone);
+    }
+}
+
+/// A convolution and the rows that it reads.
+pub(super) struct Stage<'a> {
+    pub(super) conv: Ready<'a>,
+    pub(super) input: Stream,
+    /// Rows that it has made.
+    made: usize,
+}
+
+impl<'a> Stage<'a> {
+    pub(super) fn new(conv: Ready<'a>, input: Stream) -> Self {
+        Stage {
+            conv,
+            input,
+            made: 0,
+        }
+    }
+
+    fn restart(&mut self) {
+        self.input.restart();
+        self.made = 0;
+    }
+
+    /// The rows that it can make now, whole tiles of them until the last.
+    fn pending(&self) -> Range<usize> {
+        let end = match self.input.end() {
+            end if end == self.input.height => end,
+            end => end.saturating_sub(1) / TILE_ROWS * TILE_ROWS,
+        };
+        self.made..end.max(self.made)
+    }
+
+    /// Makes them, and keeps the rows that the next ones need.
+    fn make(&mut self, rows: &Range<usize>, y: &mut [f32]) {
+        let (grid, x) = self.input.all();
+        self.conv
+            .forward(grid, x, rows.start - self.input.first, y);
+        self.made = rows.end;
+        self.input.forget_above(rows.end.saturating_sub(1));
+    }
+}
+
+/// Convolutions one after another.
+pub(super) struct Chain<'a> {
+    pub(super) stages: Vec<Stage<'a>>,
+    /// What the last one made.
+    pub(super) output: Stream,
+}
+
+impl Chain<'_> {
+    /// Back to the top, for the next image.
+    pub(super) fn restart(&mut self) {
+        self.stages.iter_mut().for_each(Stage::restart);
+        self.output.restart();
+    }
+
+    /// Where the first convolution's input comes in.
+    pub(super) fn input(&mut self) -> &mut Stream {
+        let first = self.stages.first_mut();
+        &mut first.expect("a chain of at least one convolution").input
+    }
+
+    /// Makes all that can be made of the rows that have come in. `see` is shown what each stage has made: the stage's
+    /// index, the rows and their values.
+    pub(super) fn advance(&mut self, mut see: impl FnMut(usize, Range<usize>, &[f32])) {
+        for index in 0..self.stages.len() {
+            let (stages, next) = self.stages.split_at_mut(index + 1);
+            let next = next
+                .first_mut()
+                .map_or(&mut self.output, |stage| &mut stage.input);
+            let rows = stages[index].pending();
+            if !rows.is_empty() {
+                stages[index].make(&rows, next.push(rows.len()));
+                see(index, rows.clone(), next.last(rows.len()));
+            }
+        }
+    }
+}

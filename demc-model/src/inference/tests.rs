@@ -1,0 +1,99 @@
+//! Bands against whole maps: `demc-model/tests/inference.rs` compares whole networks with Burn's operations.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use demc_kernels::conv3x3::Tile;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::forward_with;
+use crate::{Denoiser, Head, ModelConfig, Ops, Reading, Variant};
+
+/// No bands: more rows than any image here.
+const WHOLE: usize = 4096;
+
+fn network(variant: Variant, reading: Reading) -> Denoiser {
+    let config = ModelConfig {
+        variant,
+        reading,
+        width: 6,
+        head: Head::Xavier,
+    };
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    config.init(&mut rng, [0.5; 3], &Device::flex())
+}
+
+/// Batch, height, width.
+const SIZES: [[usize; 3]; 3] = [[1, 32, 32], [2, 96, 64], [1, 160, 32]];
+
+fn images([batch, height, width]: [usize; 3]) -> [Tensor<4>; 2] {
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    [3, 12].map(|channels| {
+        let shape = [batch, channels, height, width];
+        let values: Vec<f32> = (0..shape.iter().product())
+            .map(|_| rng.random_range(0.0..1.5f32))
+            .collect();
+        Tensor::from_data(TensorData::new(values, shape), &Device::flex())
+    })
+}
+
+fn run(model: &Denoiser, size: [usize; 3], tile: Tile, band: usize) -> Vec<f32> {
+    let [color, features] = images(size);
+    let out = forward_with(model, color, features, tile, band);
+    out.into_data().try_to_vec().expect("float32")
+}
+
+fn every_network(check: impl Fn(&Denoiser, &str, [usize; 3])) {
+    for variant in Variant::ALL {
+        for reading in Reading::ALL {
+            let model = network(variant, reading);
+            for size in SIZES {
+                check(&model, &format!("{variant:?} {reading:?} {size:?}"), size);
+            }
+        }
+    }
+}
+
+#[test]
+fn bands_give_the_bits_of_whole_maps() {
+    every_network(|model, name, size| {
+        for tile in [Tile::F2, Tile::F4] {
+            let whole = run(model, size, tile, WHOLE);
+            for band in [8, 24, 40] {
+                assert!(run(model, size, tile, band) == whole, "{name} {tile:?} {band}");
+            }
+        }
+    });
+}
+
+/// Of the largest value, with tiles as exact as the plain sum: roundings of float32 through 27 layers.
+const TOLERANCE: f32 = 1e-5;
+
+#[test]
+fn bands_of_small_tiles_are_burns_network() {
+    every_network(|model, name, size| {
+        let found = run(model, size, Tile::F2, 8);
+        let [color, features] = images(size);
+        let burn = model.clone().with_ops(Ops::Burn);
+        let expected: Vec<f32> = burn
+            .forward(color, features)
+            .into_data()
+            .try_to_vec()
+            .expect("float32");
+        let largest = expected.iter().fold(0.0f32, |m, x| m.max(*x));
+        assert!(largest > 0.0, "{name}: black");
+        for (f, e) in found.iter().zip(&expected) {
+            assert!((f - e).abs() <= TOLERANCE * largest, "{name}: {f} instead of {e} of {largest}");
+        }
+    });
+}
+
+#[test]
+fn an_image_in_a_batch_is_the_image_alone() {
+    let model = network(Variant::Demc, Reading::Paper);
+    let size = [2, 96, 64];
+    let both = run(&model, size, Tile::F4, 8);
+    let [color, features] = images(size).map(|images| images.slice([1..2]));
+    let out = forward_with(&model, color, features, Tile::F4, 8);
+    let second: Vec<f32> = out.into_data().try_to_vec().expect("float32");
+    assert!(both[second.len()..] == second);
+}
