@@ -139,10 +139,12 @@ fn block_size(size: usize, align: usize) -> Option<usize> {
 
 /// A block, all of it initialised, and whether it is zeros; null where there is no memory.
 fn block(size: usize) -> (*mut u8, bool) {
-    match kept().take(size) {
-        Some(address) => (std::ptr::with_exposed_provenance_mut(address), false),
-        None => (system::map(size), true),
+    if let Some(address) = kept().take(size) {
+        return (std::ptr::with_exposed_provenance_mut(address), false);
     }
+    // Pieces too small for this must not make the process larger than what it uses.
+    give_back(None);
+    (system::map(size), true)
 }
 
 /// Takes back a block.
@@ -150,14 +152,18 @@ fn block(size: usize) -> (*mut u8, bool) {
 /// # Safety
 /// It came from [`block`], of this size, and nobody uses it any more.
 unsafe fn release(pointer: *mut u8, size: usize) {
-    let mut surplus = kept().put(Block {
+    let rejected = kept().put(Block {
         address: pointer.expose_provenance(),
         size,
     });
-    while let Some(Block { address, size }) = surplus.or_else(|| kept().surplus()) {
-        // SAFETY: the caller's; joined blocks are whole pages that were mapped, and nobody's.
+    give_back(rejected);
+}
+
+/// Gives a block that was not kept, and all surplus, back to the system.
+fn give_back(mut surplus: Option<Block>) {
+    while let Some(Block { address, size }) = surplus.take().or_else(|| kept().surplus()) {
+        // SAFETY: joined blocks are whole pages that were mapped; these were kept, so they are nobody's.
         unsafe { system::unmap(std::ptr::with_exposed_provenance_mut(address), size) };
-        surplus = None;
     }
 }
 
@@ -218,17 +224,41 @@ mod system {
 /// A buffer of `len` values to write into: those of an earlier user where [`Recycler`] is the process's allocator, so
 /// that no time goes into zeros that nobody reads; zeros elsewhere.
 pub fn buffer(len: usize) -> Vec<f32> {
+    // SAFETY: any bits are a float.
+    unsafe { recycled(len) }.unwrap_or_else(|| vec![0.0; len])
+}
+
+/// Bytes in large blocks that the process uses, and the most that it used at a time; 0 where [`Recycler`] is not its
+/// allocator.
+pub fn used() -> [usize; 2] {
+    let kept = kept();
+    [kept.used, kept.most_used]
+}
+
+/// Whether `len` values of a type are kept when they are dropped.
+pub(crate) fn recycles<T>(len: usize) -> bool {
+    kept_size::<T>(len).is_some()
+}
+
+/// Bytes of the block for `len` values, where [`Recycler`] is the process's allocator and they are large.
+fn kept_size<T>(len: usize) -> Option<usize> {
     let size = len
-        .checked_mul(size_of::<f32>())
-        .and_then(|size| block_size(size, align_of::<f32>()));
-    let Some(size) = size.filter(|_| INSTALLED.load(Ordering::Relaxed)) else {
-        return vec![0.0; len];
-    };
+        .checked_mul(size_of::<T>())
+        .and_then(|size| block_size(size, align_of::<T>()));
+    size.filter(|_| INSTALLED.load(Ordering::Relaxed))
+}
+
+/// `len` values of an earlier user, where they are large and [`Recycler`] is the process's allocator.
+///
+/// # Safety
+/// Any bits are a value of `T`.
+pub(crate) unsafe fn recycled<T>(len: usize) -> Option<Vec<T>> {
+    let size = kept_size::<T>(len)?;
     let (pointer, _) = block(size);
     assert!(!pointer.is_null(), "no memory for {size} bytes");
-    // SAFETY: the block is initialised, for the kernel's pages are zeros, and `len` values fit. Recycler, which is the
-    // process's allocator, takes it back by the layout of `len` values.
-    unsafe { Vec::from_raw_parts(pointer.cast(), len, len) }
+    // SAFETY: the block is initialised, for the kernel's pages are zeros, `len` values fit, and it lies at a multiple of
+    // GRAIN. Recycler, which is the process's allocator, takes it back by the layout of `len` values.
+    Some(unsafe { Vec::from_raw_parts(pointer.cast(), len, len) })
 }
 
 // SAFETY: whether an allocation is a block, and of which size, depends on its layout alone, so that `dealloc` and

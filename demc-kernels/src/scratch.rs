@@ -1,8 +1,10 @@
 //! Buffers that are used again: a training step asks for the same sizes every time, and fresh memory costs a page
-//! fault every 4 KiB.
+//! fault every 4 KiB. Large ones are kept by the allocator, for everybody; small ones here.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::Mutex;
+
+use crate::memory;
 
 /// A cache line: what buffers are aligned to.
 #[derive(Clone, Copy)]
@@ -24,6 +26,10 @@ impl Scratch {
     /// A buffer of `len` values: the smallest returned one that is large enough, else the largest, grown.
     pub(crate) fn take(len: usize) -> Self {
         let count = len.div_ceil(LINE);
+        // SAFETY: any bits are floats.
+        if let Some(lines) = unsafe { memory::recycled(count) } {
+            return Scratch { lines, len };
+        }
         let mut lines = {
             let mut pool = POOL.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
             let fitting = pool.iter().enumerate().filter(|(_, b)| b.len() >= count);
@@ -52,6 +58,9 @@ impl Scratch {
 impl Drop for Scratch {
     fn drop(&mut self) {
         let lines = std::mem::take(&mut self.lines);
+        if memory::recycles::<Line>(lines.len()) {
+            return;
+        }
         POOL.lock()
             .unwrap_or_else(|poisoned| poisoned.into_inner())
             .push(lines);

@@ -17,9 +17,7 @@ fn network(variant: Variant, reading: Reading, width: usize) -> Denoiser {
         head: Head::Grey,
     };
     let mut rng = ChaCha8Rng::seed_from_u64(5);
-    let mut weights = config
-        .init(&mut rng, [0.5; 3], &Device::flex())
-        .weights();
+    let mut weights = config.init(&mut rng, [0.5; 3], &Device::flex()).weights();
     for weight in &mut weights {
         let (low, high) = match weight.name.rsplit('.').next().unwrap_or_default() {
             "weight" => {
@@ -71,10 +69,17 @@ fn check(variant: Variant, reading: Reading, width: usize, size: [usize; 3]) {
     let model = network(variant, reading, width);
     let expected = run(&model.clone().with_ops(Ops::Burn), size);
     let alive = expected.iter().filter(|x| **x > 0.0).count();
-    assert!(alive * 3 > expected.len(), "{alive} of {} alive", expected.len());
+    assert!(
+        alive * 3 > expected.len(),
+        "{alive} of {} alive",
+        expected.len()
+    );
     let found = deviation(&run(&model, size), &expected);
     println!("{variant:?} {reading:?} {width} {size:?}: {found:e}");
-    assert!(found <= TOLERANCE, "{variant:?} {reading:?} {width} {size:?}: {found:e}");
+    assert!(
+        found <= TOLERANCE,
+        "{variant:?} {reading:?} {width} {size:?}: {found:e}"
+    );
 }
 
 #[test]

@@ -8,11 +8,13 @@ use std::ops::Range;
 
 use demc_kernels::conv3x3::Ready;
 use demc_kernels::{Grid, memory};
+use rayon::prelude::*;
 
 /// Rows of the largest tile of a convolution.
 pub(super) const TILE_ROWS: usize = 4;
 
-/// The rows of one image's map that are there.
+/// The rows of one image's map that are there. Memory is held for those alone, so that what waits for its next band is
+/// small.
 pub(super) struct Stream {
     /// Rows of the whole map.
     height: usize,
@@ -26,22 +28,22 @@ pub(super) struct Stream {
 }
 
 impl Stream {
-    /// None yet, with room for `room`.
-    pub(super) fn new(grid: Grid, channels: usize, room: usize) -> Self {
-        let Grid { height, width, .. } = grid;
+    /// None yet.
+    pub(super) fn new(grid: Grid, channels: usize) -> Self {
         Stream {
-            height,
-            width,
+            height: grid.height,
+            width: grid.width,
             channels,
             first: 0,
             rows: 0,
-            values: memory::buffer(room.min(height) * width * channels),
+            values: Vec::new(),
         }
     }
 
     /// Back to the top, for the next image.
     pub(super) fn restart(&mut self) {
         (self.first, self.rows) = (0, 0);
+        self.values = Vec::new();
     }
 
     /// The row after the last that is there.
@@ -57,15 +59,12 @@ impl Stream {
     /// `rows` more, for the caller to write.
     pub(super) fn push(&mut self, rows: usize) -> &mut [f32] {
         let row = self.width * self.channels;
-        let (from, to) = (self.rows * row, (self.rows + rows) * row);
-        if self.values.len() < to {
-            // The last band of an image brings what all stages before held back.
-            let mut values = memory::buffer(to);
-            values[..from].copy_from_slice(&self.values[..from]);
-            self.values = values;
-        }
+        let held = self.rows * row;
+        let mut values = memory::buffer(held + rows * row);
+        copy(&self.values, &mut values[..held]);
+        self.values = values;
         self.rows += rows;
-        &mut self.values[from..to]
+        &mut self.values[held..]
     }
 
     /// The last `rows`.
@@ -87,11 +86,28 @@ impl Stream {
     /// Forgets the rows above `row`.
     pub(super) fn forget_above(&mut self, row: usize) {
         let gone = row.clamp(self.first, self.end()) - self.first;
-        let values = self.width * self.channels;
-        self.values
-            .copy_within(gone * values..self.rows * values, 0);
+        if gone == 0 {
+            return;
+        }
+        let rest = &self.values[gone * self.width * self.channels..];
+        let mut values = memory::buffer(rest.len());
+        copy(rest, &mut values);
+        self.values = values;
         (self.first, self.rows) = (self.first + gone, self.rows - gone);
     }
+
+    /// Forgets all rows.
+    pub(super) fn forget(&mut self) {
+        self.forget_above(self.end());
+    }
+}
+
+/// Values that a thread copies at a time.
+const PIECE: usize = 1 << 16;
+
+fn copy(from: &[f32], to: &mut [f32]) {
+    let pieces = to.par_chunks_mut(PIECE).zip(from.par_chunks(PIECE));
+    pieces.for_each(|(to, from)| to.copy_from_slice(from));
 }
 
 /// A convolution and the rows that it reads.
@@ -128,8 +144,7 @@ impl<'a> Stage<'a> {
     /// Makes them, and keeps the rows that the next ones need.
     fn make(&mut self, rows: &Range<usize>, y: &mut [f32]) {
         let (grid, x) = self.input.all();
-        self.conv
-            .forward(grid, x, rows.start - self.input.first, y);
+        self.conv.forward(grid, x, rows.start - self.input.first, y);
         self.made = rows.end;
         self.input.forget_above(rows.end.saturating_sub(1));
     }

@@ -7,7 +7,7 @@ use demc_kernels::conv3x3::Ready;
 use demc_kernels::{Grid, pool};
 use rayon::prelude::*;
 
-use super::band::{Chain, Stage, Stream, TILE_ROWS};
+use super::band::{Chain, Stage, Stream};
 use super::layer::Layer;
 use super::{Images, Maps, Run};
 use crate::config::{DETAIL_CHANNELS, Input, LEVELS};
@@ -76,33 +76,34 @@ impl Run<'_> {
     /// skips' share of the level's fusion.
     fn descend(&self, level: usize, inputs: &mut Vec<Maps>) -> Maps {
         let grid = inputs[0].grid;
-        let mut skips = Vec::with_capacity(inputs.len());
-        for (encoder, input) in self.model.encoders.iter().zip(std::mem::take(inputs)) {
-            let level = &encoder.levels[level];
-            let mut x = input;
-            for conv in &level.convs[..level.skip_after] {
-                x = self.conv3x3(&x, &Layer::conv(conv, None));
-            }
-            let skip = x;
-            if level.pooled {
-                let mut last = None;
-                for conv in &level.convs[level.skip_after..] {
-                    let x = last.as_ref().unwrap_or(&skip);
-                    last = Some(self.conv3x3(x, &Layer::conv(conv, None)));
-                }
-                let last = last.as_ref().unwrap_or(&skip);
-                let mut below = Maps::new(grid.halved(), last.channels());
-                pool::forward(self.isa, grid, &last.values, &mut below.values);
-                inputs.push(below);
-            }
-            skips.push(skip);
-        }
         let fuse = self.fuse(level);
         let mut sum = Maps::new(grid, fuse.outputs());
-        let skips: Vec<&[f32]> = skips.iter().map(|skip| &skip.values[..]).collect();
-        let (finish, first) = (Finish::default(), fuse.outputs());
-        conv1x1::part(self.isa, grid, &skips, fuse.weight(), first, finish, &mut sum.values);
+        for (index, input) in std::mem::take(inputs).into_iter().enumerate() {
+            let level = &self.model.encoders[index].levels[level];
+            let mut x = input;
+            for (made, conv) in level.convs.iter().enumerate() {
+                x = self.conv3x3(&x, &Layer::conv(conv, None));
+                if made + 1 == level.skip_after {
+                    self.add_skip(index, grid, &x.values, &fuse, &mut sum.values);
+                }
+            }
+            if level.pooled {
+                let mut below = Maps::new(grid.halved(), x.channels());
+                pool::forward(self.isa, grid, &x.values, &mut below.values);
+                inputs.push(below);
+            }
+        }
         sum
+    }
+
+    /// Adds an encoder's skip, times its part of a fusion, to what those before it gave.
+    fn add_skip(&self, encoder: usize, grid: Grid, skip: &[f32], fuse: &Layer, sum: &mut [f32]) {
+        let first = (1 + encoder) * fuse.outputs();
+        let finish = Finish {
+            add: encoder > 0,
+            ..Finish::default()
+        };
+        conv1x1::part(self.isa, grid, &[skip], fuse.weight(), first, finish, sum);
     }
 
     /// The same in bands, encoder by encoder.
@@ -123,7 +124,15 @@ impl Run<'_> {
                     let push = levels[0].chain.input().push(rows.len());
                     push.copy_from_slice(input.rows(image, rows));
                     let sums = std::slice::from_mut(&mut sum);
-                    self.flow(&mut levels, fuses, sums, index, image, pooled.as_mut(), &mut to);
+                    self.flow(
+                        &mut levels,
+                        fuses,
+                        sums,
+                        index,
+                        image,
+                        pooled.as_mut(),
+                        &mut to,
+                    );
                 }
             }
             below.extend(pooled);
@@ -147,7 +156,7 @@ impl Run<'_> {
             Some(fusion) => fusion.blocks.iter().map(block_layer).collect(),
             None => Vec::new(),
         };
-        let mut fusion = (!blocks.is_empty()).then(|| self.chain(&blocks, grid, band));
+        let mut fusion = (!blocks.is_empty()).then(|| self.chain(&blocks, grid));
         let layers: Vec<_> = (0..inputs.len())
             .map(|index| self.layers(index, 0..LEVELS_IN_STEP))
             .collect();
@@ -172,7 +181,7 @@ impl Run<'_> {
                 if let Some(fusion) = &mut fusion {
                     let push = fusion.input().push(rows.len());
                     images.interleave(image, rows, &[Input::Features], None, push);
-                    fusion.output.forget_above(grid.height);
+                    fusion.output.forget();
                     fusion.advance(|_, _, _| ());
                     rows = fusion.output.range();
                 }
@@ -208,16 +217,10 @@ impl Run<'_> {
             let (upper, lower) = levels.split_at_mut(index + 1);
             let Level { chain, skip_after } = &mut upper[index];
             let (fuse, sum) = (&fuses[index], &mut sums[index]);
-            let first = (1 + encoder) * fuse.outputs();
-            let finish = Finish {
-                add: encoder > 0,
-                ..Finish::default()
-            };
             chain.advance(|stage, rows, values| {
                 if stage + 1 == *skip_after {
                     let grid = sum.band(rows.len());
-                    let sum = sum.rows_mut(image, rows);
-                    conv1x1::part(self.isa, grid, &[values], fuse.weight(), first, finish, sum);
+                    self.add_skip(encoder, grid, values, fuse, sum.rows_mut(image, rows));
                 }
             });
             let (grid, made) = chain.output.all();
@@ -236,8 +239,7 @@ impl Run<'_> {
                     *to += rows;
                 }
             }
-            let end = chain.output.range().end;
-            chain.output.forget_above(end);
+            chain.output.forget();
         }
     }
 
@@ -262,14 +264,14 @@ impl Run<'_> {
         layers: &'a [Vec<Layer>],
     ) -> Vec<Level<'a>> {
         let specs: &[EncoderLevel] = &self.model.encoders[encoder].levels[levels];
-        let (mut grid, mut band) = (grid, self.band_rows(grid));
+        let mut grid = grid;
         let mut ready = Vec::with_capacity(layers.len());
         for (spec, layers) in specs.iter().zip(layers) {
             ready.push(Level {
-                chain: self.chain(layers, grid, band),
+                chain: self.chain(layers, grid),
                 skip_after: spec.skip_after,
             });
-            (grid, band) = (grid.halved(), band.div_ceil(2));
+            grid = grid.halved();
         }
         ready
     }
@@ -282,20 +284,19 @@ impl Run<'_> {
     }
 
     /// The convolutions of these layers for bands of an image on `grid`, each with its ReLU.
-    fn chain<'a>(&self, layers: &'a [Layer], grid: Grid, band: usize) -> Chain<'a> {
-        let room = band + 2 * TILE_ROWS;
+    fn chain<'a>(&self, layers: &'a [Layer], grid: Grid) -> Chain<'a> {
         let stages: Vec<Stage> = layers
             .iter()
             .map(|layer| {
                 let conv = Ready::new(self.isa, self.tile, layer.weight(), layer.bias(), true);
                 let inputs = conv.inputs();
-                Stage::new(conv, Stream::new(grid, inputs, room))
+                Stage::new(conv, Stream::new(grid, inputs))
             })
             .collect();
         let outputs = layers.last().map_or(0, Layer::outputs);
         Chain {
             stages,
-            output: Stream::new(grid, outputs, room),
+            output: Stream::new(grid, outputs),
         }
     }
 

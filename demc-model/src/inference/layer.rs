@@ -72,11 +72,7 @@ impl Layer {
     }
 
     /// `scale_weight` multiplies what gives an output channel with that channel's scale.
-    fn folded(
-        self,
-        norm: Option<&BatchNorm>,
-        scale_weight: impl Fn(&mut [f32], &[f32]),
-    ) -> Self {
+    fn folded(self, norm: Option<&BatchNorm>, scale_weight: impl Fn(&mut [f32], &[f32])) -> Self {
         let Some(norm) = norm else { return self };
         let [gamma, beta] = [&norm.gamma, &norm.beta].map(|p| Values::of(p.val()));
         let [mean, variance] =

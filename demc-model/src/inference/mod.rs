@@ -32,7 +32,7 @@ use band::TILE_ROWS;
 use layer::Layer;
 
 /// Pixels of the full resolution in a band, for each thread: enough work to wake threads for, little enough for caches.
-const BAND_PIXELS: usize = 10 << 10;
+const BAND_PIXELS: usize = 20 << 10;
 
 /// Whether an image on this tensor's device is denoised here.
 pub(crate) fn applies(model: &Denoiser, image: &Tensor<4>) -> bool {
@@ -97,10 +97,15 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
-    /// Rows of a band of maps on `grid`. At every level a row is as many values and as much work: as the width halves, the
-    /// channels double.
-    fn band_rows(&self, _grid: Grid) -> usize {
-        self.band
+    /// Rows of a band of maps on `grid`, or all. At every level a row is as many values and as much work: as the width
+    /// halves, the channels double.
+    fn band_rows(&self, grid: Grid) -> usize {
+        // Less than three bands save nothing.
+        if grid.height <= 2 * self.band {
+            grid.height
+        } else {
+            self.band
+        }
     }
 
     /// A convolution with its ReLU, of whole maps.
@@ -175,6 +180,9 @@ impl Maps {
     /// These rows with one more on each side where there is one, and how many there are above.
     fn with_neighbours(&self, rows: Range<usize>) -> (Range<usize>, usize) {
         let start = rows.start.saturating_sub(1);
-        (start..(rows.end + 1).min(self.grid.height), rows.start - start)
+        (
+            start..(rows.end + 1).min(self.grid.height),
+            rows.start - start,
+        )
     }
 }

@@ -59,7 +59,10 @@ fn bands_give_the_bits_of_whole_maps() {
         for tile in [Tile::F2, Tile::F4] {
             let whole = run(model, size, tile, WHOLE);
             for band in [8, 24, 40] {
-                assert!(run(model, size, tile, band) == whole, "{name} {tile:?} {band}");
+                assert!(
+                    run(model, size, tile, band) == whole,
+                    "{name} {tile:?} {band}"
+                );
             }
         }
     });
@@ -82,7 +85,10 @@ fn bands_of_small_tiles_are_burns_network() {
         let largest = expected.iter().fold(0.0f32, |m, x| m.max(*x));
         assert!(largest > 0.0, "{name}: black");
         for (f, e) in found.iter().zip(&expected) {
-            assert!((f - e).abs() <= TOLERANCE * largest, "{name}: {f} instead of {e} of {largest}");
+            assert!(
+                (f - e).abs() <= TOLERANCE * largest,
+                "{name}: {f} instead of {e} of {largest}"
+            );
         }
     });
 }
