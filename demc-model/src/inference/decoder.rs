@@ -37,13 +37,13 @@ impl Run<'_> {
         let fuse = |grid: Grid, decoded: &[f32], sum: &mut [f32]| {
             conv1x1::part(self.isa, grid, &[decoded], fuse.weight(), 0, finish, sum);
         };
-        let band = self.band_rows(grid);
-        if band >= grid.height {
+        if !self.plan.is_banded(grid) {
             let mut decoded = memory::buffer(grid.pixels() * layer.outputs());
             deconv.forward(below.grid, &below.values, 0, &mut decoded);
             fuse(grid, &decoded, &mut sum.values);
             return sum;
         }
+        let band = self.plan.band;
         let mut decoded = memory::buffer(band * grid.width * layer.outputs());
         for image in 0..grid.batch {
             for rows in bands(below.grid.height, band / 2) {
@@ -64,7 +64,7 @@ impl Run<'_> {
         let (weight, bias) = (layer.weight(), layer.bias());
         let conv = conv3x3::Ready::new(self.isa, self.tile, weight, bias, true);
         let mut planar = memory::buffer(x.grid.pixels() * COLOR_CHANNELS);
-        let band = self.band_rows(x.grid).min(height);
+        let band = self.plan.band_rows(x.grid);
         let mut colors = memory::buffer(band * width * COLOR_CHANNELS);
         for (image, planar) in planar
             .chunks_exact_mut(height * width * COLOR_CHANNELS)

@@ -20,7 +20,7 @@ use crate::layers::ConvBlock;
 pub(super) const LEVELS_IN_STEP: usize = 2;
 
 /// Deepest level that is computed in bands; below it, a map is smaller than the ready weights of its convolutions.
-const DEEPEST_BANDED: usize = 2;
+pub(super) const DEEPEST_BANDED: usize = 2;
 
 /// What the encoders leave for the decoder.
 pub(super) struct Encoded {
@@ -33,19 +33,14 @@ pub(super) struct Encoded {
 impl Run<'_> {
     /// All encoders, all levels.
     pub(super) fn encode(&self, images: Images) -> Encoded {
-        let grid = images.grid;
         let mut sums = Vec::with_capacity(LEVELS);
-        let mut inputs = Vec::new();
-        if self.band_rows(grid) < grid.height {
-            inputs = self.descend_in_step(images, &mut sums);
-        } else {
-            for spec in self.model.config().variant.spec().encoders {
-                inputs.push(self.input(&images, spec));
-            }
-        }
+        let mut inputs = match self.plan.is_banded(images.grid) {
+            true => self.descend_in_step(images, &mut sums),
+            false => self.inputs(images),
+        };
         for level in sums.len()..LEVELS {
             let grid = inputs[0].grid;
-            let banded = level <= DEEPEST_BANDED && self.band_rows(grid) < grid.height;
+            let banded = level <= DEEPEST_BANDED && self.plan.is_banded(grid);
             sums.push(match banded {
                 true => self.descend_in_bands(level, &mut inputs),
                 false => self.descend(level, &mut inputs),
@@ -55,16 +50,18 @@ impl Run<'_> {
         Encoded { sums, bottom }
     }
 
-    /// What an encoder eats, at once.
-    fn input(&self, images: &Images, parts: &[Input]) -> Maps {
-        let detail = parts.contains(&Input::DetailMap).then(|| {
+    /// What the encoders eat, at once.
+    fn inputs(&self, images: Images) -> Vec<Maps> {
+        let spec = self.model.config().variant.spec();
+        let detail = spec.has_fusion().then(|| {
             let features = images.interleaved(&[Input::Features], None);
-            self.fusion()
-                .blocks
-                .iter()
-                .fold(features, |x, block| self.conv3x3(&x, &block_layer(block)))
+            let blocks = self.fusion().blocks.iter();
+            blocks.fold(features, |x, block| self.conv3x3(&x, &block_layer(block)))
         });
-        images.interleaved(parts, detail.as_ref())
+        let parts = spec.encoders.iter();
+        parts
+            .map(|parts| images.interleaved(parts, detail.as_ref()))
+            .collect()
     }
 
     fn fusion(&self) -> &Fusion {
@@ -120,7 +117,7 @@ impl Run<'_> {
             for image in 0..grid.batch {
                 levels.iter_mut().for_each(|level| level.chain.restart());
                 let mut to = 0;
-                for rows in bands(grid.height, self.band_rows(grid)) {
+                for rows in bands(grid.height, self.plan.band_rows(grid)) {
                     let push = levels[0].chain.input().push(rows.len());
                     push.copy_from_slice(input.rows(image, rows));
                     let sums = std::slice::from_mut(&mut sum);
@@ -144,7 +141,7 @@ impl Run<'_> {
     /// Takes all encoders from the images down [`LEVELS_IN_STEP`] levels, band by band. Adds the skips' shares of the
     /// fusions to `sums` and returns the inputs of the level below.
     fn descend_in_step(&self, images: Images, sums: &mut Vec<Maps>) -> Vec<Maps> {
-        let (grid, band) = (images.grid, self.band_rows(images.grid));
+        let (grid, band) = (images.grid, self.plan.band_rows(images.grid));
         let inputs = self.model.config().variant.spec().encoders;
         let fuses: Vec<Layer> = (0..LEVELS_IN_STEP).map(|level| self.fuse(level)).collect();
         let mut size = grid;

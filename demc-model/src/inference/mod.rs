@@ -13,6 +13,7 @@
 mod band;
 mod decoder;
 mod encoder;
+mod estimate;
 mod layer;
 #[cfg(test)]
 mod tests;
@@ -31,8 +32,13 @@ use crate::ops::Ops;
 use band::TILE_ROWS;
 use layer::Layer;
 
+pub use estimate::peak_bytes;
+
 /// Pixels of the full resolution in a band, for each thread: enough work to wake threads for, little enough for caches.
 const BAND_PIXELS: usize = 20 << 10;
+
+/// What a band's rows are a multiple of: a tile at the level below, too.
+const BAND_STEP: usize = 2 * TILE_ROWS;
 
 /// Whether an image on this tensor's device is denoised here.
 pub(crate) fn applies(model: &Denoiser, image: &Tensor<4>) -> bool {
@@ -47,24 +53,23 @@ pub(crate) fn forward(
     color_gamma: Tensor<4>,
     features_z: Tensor<4>,
 ) -> Tensor<4> {
-    let [_, _, _, width] = color_gamma.dims();
-    let band = BAND_PIXELS * rayon::current_num_threads() / width;
-    forward_with(model, color_gamma, features_z, Tile::F4, band)
+    let plan = Plan::new(color_gamma.dims()[3]);
+    forward_with(model, color_gamma, features_z, Tile::F4, plan)
 }
 
-/// The same with tiles of a given size, in bands of about `band` rows.
+/// The same with tiles of a given size and another plan.
 fn forward_with(
     model: &Denoiser,
     color_gamma: Tensor<4>,
     features_z: Tensor<4>,
     tile: Tile,
-    band: usize,
+    plan: Plan,
 ) -> Tensor<4> {
     let [batch, _, height, width] = color_gamma.dims();
     let run = Run {
         isa: Isa::current(),
         tile,
-        band: band.max(1).next_multiple_of(2 * TILE_ROWS),
+        plan,
         model,
     };
     let images = Images {
@@ -87,27 +92,50 @@ fn host(tensor: Tensor<4>) -> FlexTensor {
     tensor.to_contiguous()
 }
 
+/// How an image is cut.
+#[derive(Clone, Copy)]
+struct Plan {
+    /// Rows of a band. At every level a row is as many values and as much work: as the width halves, the channels double.
+    band: usize,
+    /// Threads that share the work on a band.
+    threads: usize,
+}
+
+impl Plan {
+    /// For images of this width and the threads at hand.
+    fn new(width: usize) -> Self {
+        let threads = rayon::current_num_threads();
+        Plan {
+            band: (BAND_PIXELS * threads / width)
+                .next_multiple_of(BAND_STEP)
+                .max(BAND_STEP),
+            threads,
+        }
+    }
+
+    /// Whether maps on `grid` come in bands: two bands or less save nothing.
+    fn is_banded(self, grid: Grid) -> bool {
+        grid.height > 2 * self.band
+    }
+
+    /// Rows of a band of maps on `grid`: all where they do not come in bands.
+    fn band_rows(self, grid: Grid) -> usize {
+        match self.is_banded(grid) {
+            true => self.band,
+            false => grid.height,
+        }
+    }
+}
+
 /// One pass through the network.
 struct Run<'a> {
     isa: Isa,
     tile: Tile,
-    /// Rows of a band.
-    band: usize,
+    plan: Plan,
     model: &'a Denoiser,
 }
 
 impl Run<'_> {
-    /// Rows of a band of maps on `grid`, or all. At every level a row is as many values and as much work: as the width
-    /// halves, the channels double.
-    fn band_rows(&self, grid: Grid) -> usize {
-        // Less than three bands save nothing.
-        if grid.height <= 2 * self.band {
-            grid.height
-        } else {
-            self.band
-        }
-    }
-
     /// A convolution with its ReLU, of whole maps.
     fn conv3x3(&self, x: &Maps, layer: &Layer) -> Maps {
         let mut y = Maps::new(x.grid, layer.outputs());

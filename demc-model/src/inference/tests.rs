@@ -5,7 +5,7 @@ use demc_kernels::conv3x3::Tile;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::forward_with;
+use super::{Plan, forward_with};
 use crate::{Denoiser, Head, ModelConfig, Ops, Reading, Variant};
 
 /// No bands: more rows than any image here.
@@ -36,9 +36,17 @@ fn images([batch, height, width]: [usize; 3]) -> [Tensor<4>; 2] {
     })
 }
 
+/// Bands of so many rows.
+fn plan(band: usize) -> Plan {
+    Plan {
+        band,
+        ..Plan::new(1)
+    }
+}
+
 fn run(model: &Denoiser, size: [usize; 3], tile: Tile, band: usize) -> Vec<f32> {
     let [color, features] = images(size);
-    let out = forward_with(model, color, features, tile, band);
+    let out = forward_with(model, color, features, tile, plan(band));
     out.into_data().try_to_vec().expect("float32")
 }
 
@@ -99,7 +107,7 @@ fn an_image_in_a_batch_is_the_image_alone() {
     let size = [2, 96, 64];
     let both = run(&model, size, Tile::F4, 8);
     let [color, features] = images(size).map(|images| images.slice([1..2]));
-    let out = forward_with(&model, color, features, Tile::F4, 8);
+    let out = forward_with(&model, color, features, Tile::F4, plan(8));
     let second: Vec<f32> = out.into_data().try_to_vec().expect("float32");
     assert!(both[second.len()..] == second);
 }

@@ -1,0 +1,56 @@
+//! What a pass really allocates, against what is said before.
+//!
+//! A file of its own, with one test: all that runs in its process is counted.
+
+use burn::tensor::{Device, Tensor};
+use demc_kernels::memory::{Recycler, used};
+use demc_model::inference::peak_bytes;
+use demc_model::{Head, ModelConfig, Reading, Variant};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+#[global_allocator]
+static ALLOCATOR: Recycler = Recycler;
+
+/// Blocks below 2 MiB are not counted, and threads reach their peaks at different times.
+const TOLERANCE: f64 = 0.1;
+
+#[test]
+#[cfg(target_os = "linux")]
+fn the_estimate_is_what_a_pass_allocates() {
+    let device = Device::flex();
+    // In the order of their sizes: the most so far is what can be told.
+    let cases = [
+        (Variant::Demc, Reading::Paper, 24, [512, 512]),
+        (Variant::DemcNosn, Reading::Paper, 24, [1024, 512]),
+        (Variant::Demc, Reading::Released, 24, [768, 768]),
+        (Variant::Semc, Reading::Paper, 32, [736, 1280]),
+        (Variant::Demc, Reading::Paper, 32, [1088, 1920]),
+    ];
+    for (variant, reading, width, [height, columns]) in cases {
+        let config = ModelConfig {
+            variant,
+            reading,
+            width,
+            head: Head::Grey,
+        };
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let model = config.init(&mut rng, [0.5; 3], &device);
+        let [before, _] = used();
+        let image = |channels| Tensor::<4>::ones([1, channels, height, columns], &device);
+        let out = model.forward(image(3), image(12));
+        let [_, most] = used();
+        assert_eq!(out.dims(), [1, 3, height, columns]);
+        let (found, said) = (most - before, peak_bytes(&config, height, columns));
+        let ratio = said as f64 / found as f64;
+        println!(
+            "{config:?} {height}x{columns}: {} MiB said, {} MiB found",
+            said >> 20,
+            found >> 20
+        );
+        assert!(
+            (ratio - 1.0).abs() <= TOLERANCE,
+            "{config:?}: {said} bytes said, {found} found"
+        );
+    }
+}
