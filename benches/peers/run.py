@@ -41,10 +41,10 @@ QUICK_TURN_SECONDS = 0.05
 QUIET = 0.05  # share of the machine that other processes may take in a turn before the report says so
 TURN_SECONDS = 1.0  # a turn takes as many steps as fit, and at least one
 # What peers may deviate by: outputs, of the largest value; and losses and norms, relative. f32: rounding takes 2e-6 of an
-# output and, after two steps of Adam, 2e-5 of a loss or norm (at ten times the learning rate 4e-3, since Adam's first step
+# output and, after two steps of Adam, 2e-5 of a loss or norm at C = 16, 4e-4 at C = 64 (at ten times the learning rate 4e-3, since Adam's first step
 # is as long for a gradient that is all rounding as for a large one). The other two, on GPUs, keep 10 and 8 bits; their
 # bounds are a guess until a GPU has been at hand.
-TOLERANCES = {"f32": (1e-4, 2e-4), "tf32": (1e-2, 5e-2), "bf16": (1e-1, 3e-1)}
+TOLERANCES = {"f32": (1e-4, 1e-3), "tf32": (1e-2, 5e-2), "bf16": (1e-1, 3e-1)}
 
 
 @dataclass(frozen=True)
