@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 pub mod bundle;
+pub mod compute;
 pub mod denoise;
 pub mod device;
 pub mod evaluate;

@@ -282,3 +282,56 @@ fn no_arguments_show_the_commands() {
         assert!(outcome.stderr.contains(command), "{}", outcome.stderr);
     }
 }
+
+/// Kernels and Burn's operations, and every instruction path of this machine, score the same.
+#[test]
+fn every_way_to_compute_scores_the_same() {
+    use demc_model::ops::Isa;
+    let run = run_directory();
+    let score = |flag: &str, value: &str| -> f64 {
+        let file = run.path().join("scores.json");
+        let list = arguments![
+            "evaluate",
+            "--model",
+            run.path(),
+            "--data",
+            sample(),
+            "--json",
+            file,
+            flag,
+            value
+        ];
+        demc_infer(list).success();
+        json(&file)["mean"]["denoised"]["relmse"]
+            .as_f64()
+            .expect("number")
+    };
+    let burn = score("--ops", "burn");
+    for isa in Isa::available() {
+        let kernels = score("--isa", isa.name());
+        // Outputs agree to 1e-5 of the largest; the score squares them.
+        assert!(
+            (kernels / burn - 1.0).abs() < 1e-4,
+            "{isa}: {kernels} {burn}"
+        );
+    }
+}
+
+#[test]
+fn operations_and_instructions_that_do_not_exist_are_usage_errors() {
+    let run = run_directory();
+    for (flag, listed) in [("--ops", "kernels, burn"), ("--isa", "portable")] {
+        let list = arguments![
+            "evaluate",
+            "--model",
+            run.path(),
+            "--data",
+            sample(),
+            flag,
+            "none"
+        ];
+        let outcome = demc_infer(list);
+        assert_eq!(outcome.code, 2, "{}", outcome.stderr);
+        assert!(outcome.stderr.contains(listed), "{}", outcome.stderr);
+    }
+}

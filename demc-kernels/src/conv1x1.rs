@@ -347,7 +347,7 @@ fn check(
 mod tests {
     use super::*;
     use crate::reference;
-    use crate::testing::{assert_close, f64s, grids, pattern};
+    use crate::testing::{assert_close, f64s, few, grids, pattern};
 
     fn concatenated(grid: Grid, xs: &[&[f32]]) -> Vec<f64> {
         let rows = (0..grid.pixels()).flat_map(|p| {
@@ -397,12 +397,13 @@ mod tests {
     fn equals_the_reference_of_the_concatenation_on_every_path() {
         for isa in Isa::available() {
             for grid in grids() {
-                for (inputs, outputs) in [
+                let cases = vec![
                     (vec![6, 6, 6], 6),
                     (vec![1], 1),
                     (vec![33, 17], 40),
                     (vec![64, 64, 64], 64),
-                ] {
+                ];
+                for (inputs, outputs) in few(cases, 2) {
                     let maps: Vec<Vec<f32>> = inputs
                         .iter()
                         .enumerate()

@@ -228,22 +228,23 @@ fn check(grid: Grid, x: usize, weight: usize, outputs: usize, y: usize) -> (usiz
 mod tests {
     use super::*;
     use crate::reference;
-    use crate::testing::{assert_close, f64s, grids, pattern};
+    use crate::testing::{assert_close, f64s, few, grids, pattern};
 
     #[test]
     fn equals_the_reference_on_every_path_at_odd_sizes() {
         for isa in Isa::available() {
             for (case, grid) in grids().into_iter().enumerate() {
-                for (inputs, outputs) in [
+                let cases = vec![
                     (3, 8),
-                    (12, 5),
-                    (1, 1),
                     (9, 3),
                     (8, 8),
+                    (12, 5),
+                    (1, 1),
                     (17, 33),
                     (20, 8),
                     (66, 16),
-                ] {
+                ];
+                for (inputs, outputs) in few(cases, 3) {
                     let x = pattern(grid.pixels() * inputs, 1 + case as u32);
                     let weight = pattern(outputs * inputs * 9, 2);
                     let bias = pattern(outputs, 3);
@@ -334,7 +335,7 @@ mod tests {
     fn larger_tiles_keep_1e_4() {
         for isa in Isa::available() {
             for grid in grids() {
-                let (inputs, outputs) = (64, 17);
+                let (inputs, outputs) = if cfg!(miri) { (9, 8) } else { (64, 17) };
                 let x = pattern(grid.pixels() * inputs, 1);
                 let weight = pattern(outputs * inputs * 9, 2);
                 let bias = pattern(outputs, 3);

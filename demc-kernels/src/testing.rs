@@ -23,6 +23,14 @@ pub(crate) fn grids() -> Vec<Grid> {
     grids.collect()
 }
 
+/// All cases, or the first ones under Miri, which takes a minute for what takes a millisecond.
+pub(crate) fn few<T>(mut cases: Vec<T>, under_miri: usize) -> Vec<T> {
+    if cfg!(miri) {
+        cases.truncate(under_miri);
+    }
+    cases
+}
+
 /// Values from -1 to 1 that repeat late.
 pub(crate) fn pattern(len: usize, seed: u32) -> Vec<f32> {
     let mut state = seed.wrapping_mul(2654435769);

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Parser;
+use demc_infer::compute::{self, ComputeFlags};
 use demc_infer::device;
 use demc_train::checkpoint;
 use demc_train::config::Config;
@@ -36,6 +37,9 @@ pub struct Arguments {
     #[arg(short, long, value_name = "DEVICE", default_value = "flex")]
     device: String,
 
+    #[command(flatten)]
+    compute: ComputeFlags,
+
     /// Change a key of the configuration, such as train.steps=1000; can be given several times
     #[arg(short, long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -61,6 +65,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         ));
     }
     let config = Config::load(&arguments.config, &sets)?;
+    arguments.compute.apply()?;
     let dir = RunDir::claim(&config, arguments.resume)?;
     let device = device::parse(&arguments.device)?;
     let data = Data::open(&config.data, config.train.seed)?;
@@ -79,8 +84,10 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
     let estimate = Estimate::measure(&config, &data, first, &device.clone().autodiff());
     let run_path = dir.path().to_owned();
     say(format!(
-        "demc-train: {estimate} for steps {first} to {} on {}",
-        config.train.steps, arguments.device
+        "demc-train: {estimate} for steps {first} to {} on {} ({})",
+        config.train.steps,
+        arguments.device,
+        compute::describe(&device)
     ));
     say(format!("\n{}", config.to_toml()));
     say(format!(

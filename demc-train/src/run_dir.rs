@@ -55,6 +55,9 @@ struct Record {
     burn: String,
     /// Device of the first start.
     device: String,
+    /// Operations of the first start; empty in a run that began before there was a choice.
+    #[serde(default)]
+    operations: String,
     /// Trainable values of the network.
     parameters: usize,
     /// Patches of an epoch.
@@ -73,6 +76,7 @@ impl Record {
             demc: env!("CARGO_PKG_VERSION").to_string(),
             burn: BURN.to_string(),
             device: facts.device.to_string(),
+            operations: facts.operations.to_string(),
             parameters: facts.parameters,
             patches: facts.patches,
             scenes: Scenes::of(data),
@@ -105,6 +109,8 @@ impl Scenes {
 pub struct Facts<'a> {
     /// Name of the device.
     pub device: &'a str,
+    /// The operations that run there, and on which instructions.
+    pub operations: &'a str,
     /// Trainable values of the network.
     pub parameters: usize,
     /// Patches of an epoch.
@@ -194,8 +200,8 @@ impl RunDir {
         }
         let versions = |record: &Record| {
             format!(
-                "demc {}, Burn {}, {}",
-                record.demc, record.burn, record.device
+                "demc {}, Burn {}, {}, {}",
+                record.demc, record.burn, record.device, record.operations
             )
         };
         let (then, now) = (versions(&began), versions(&now));

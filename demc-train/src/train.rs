@@ -112,6 +112,7 @@ impl Run {
     pub fn train(&mut self, device: &str) -> anyhow::Result<()> {
         let facts = Facts {
             device,
+            operations: &self.trainer.operations(),
             parameters: self.parameters(),
             patches: self.patches(),
         };

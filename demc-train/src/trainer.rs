@@ -3,7 +3,7 @@
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_data::{Batch, FEATURES};
-use demc_model::metrics::{hdr_from_gamma, rel_mse};
+use demc_model::metrics;
 use demc_model::{Denoiser, ModelConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -70,6 +70,11 @@ impl Trainer {
         &self.adam
     }
 
+    /// The operations that run, in words.
+    pub fn operations(&self) -> String {
+        self.model().ops().describe(&self.device)
+    }
+
     /// Takes one step at learning rate `lr` on `train.grad_accumulation` batches.
     ///
     /// # Errors
@@ -117,9 +122,11 @@ impl Trainer {
         let features_z = tensor(&batch.features_z, FEATURES);
         let ref_hdr = tensor(&batch.reference_hdr, 3);
         let out_gamma = self.model().forward(color_gamma, features_z);
-        rel_mse(
-            hdr_from_gamma(out_gamma, self.gamma),
+        metrics::loss(
+            self.model().ops(),
+            out_gamma,
             ref_hdr,
+            self.gamma,
             self.config.loss_epsilon,
         )
     }

@@ -17,7 +17,9 @@ fn a_short_run_leaves_everything_behind() {
     let text = String::from_utf8_lossy(&output.stdout);
     let first = text.lines().next().expect("a line");
     assert!(
-        first.starts_with("demc-train: about ") && first.contains("a step"),
+        first.starts_with("demc-train: about ")
+            && first.contains("a step")
+            && first.contains("(kernels on "),
         "{first}"
     );
     assert!(

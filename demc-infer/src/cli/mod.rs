@@ -11,6 +11,7 @@ mod inspect;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Parser, Subcommand};
+use demc_infer::compute::ComputeFlags;
 use demc_infer::{Bundle, device};
 
 /// Use a trained DEMC network: denoise renders, score it, export its weights.
@@ -56,18 +57,22 @@ struct Model {
     path: PathBuf,
 }
 
-/// `--device`, for the commands that compute.
+/// `--device` and how it computes, for the commands that do.
 #[derive(Args)]
 struct DeviceFlag {
     /// What computes: flex (CPU, always there), or ndarray, wgpu[:N], cuda[:N] where built in
     #[arg(long = "device", value_name = "DEVICE", default_value = "flex")]
     name: String,
+    #[command(flatten)]
+    compute: ComputeFlags,
 }
 
 impl Model {
     /// Loads onto the device called `name`.
     fn load_onto(&self, device: &DeviceFlag) -> anyhow::Result<Bundle> {
-        let device = device::parse(&device.name).map_err(|error| Usage(error.to_string()))?;
+        let usage = |error: &dyn std::error::Error| Usage(error.to_string());
+        device.compute.apply().map_err(|error| usage(&error))?;
+        let device = device::parse(&device.name).map_err(|error| usage(&error))?;
         Ok(Bundle::load(&self.path, &device)?)
     }
 }

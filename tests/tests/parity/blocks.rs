@@ -6,7 +6,8 @@ use std::collections::BTreeMap;
 
 use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
-use demc_model::metrics::{LOSS_EPSILON, hdr_from_gamma, rel_mse};
+use demc_model::metrics::{LOSS_EPSILON, loss};
+use demc_model::ops::{self, Activation, Maps};
 use demc_model::{Denoiser, Reading, Variant};
 
 use crate::fixture::{
@@ -16,7 +17,7 @@ use crate::tensors::{Tolerance, assert_close};
 use crate::{GRADIENT, OUTPUT};
 
 /// What runs one block of a network: its inputs to its outputs.
-type Forward = fn(&Denoiser, Vec<Tensor<4>>) -> Vec<Tensor<4>>;
+type Forward = fn(&Denoiser, Vec<Maps>) -> Vec<Maps>;
 
 #[test]
 fn fusion_is_pytorchs() {
@@ -70,7 +71,7 @@ fn head_is_pytorchs() {
     let forward: Forward = |model, inputs| {
         inputs
             .into_iter()
-            .map(|x| model.decoder.head.forward(x))
+            .map(|x| x.conv3x3(&model.decoder.head, Activation::None))
             .collect()
     };
     in_both_readings("decoder.head", forward);
@@ -82,7 +83,13 @@ fn loss_and_its_gradient_are_pytorchs_at_black_pixels_too() {
     let device = crate::device().autodiff();
     let output = fixture.tensor("loss/output_gamma", &device).require_grad();
     let reference = fixture.tensor("loss/reference_hdr", &device);
-    let loss = rel_mse(hdr_from_gamma(output.clone(), 2.2), reference, LOSS_EPSILON);
+    let loss = loss(
+        ops::process_default(),
+        output.clone(),
+        reference,
+        2.2,
+        LOSS_EPSILON,
+    );
     assert_close(
         "loss",
         &host(loss.clone()),
@@ -100,16 +107,19 @@ fn loss_and_its_gradient_are_pytorchs_at_black_pixels_too() {
     );
 }
 
-fn encode(
-    model: &Denoiser,
-    [encoder, level]: [usize; 2],
-    inputs: Vec<Tensor<4>>,
-) -> Vec<Tensor<4>> {
+fn encode(model: &Denoiser, [encoder, level]: [usize; 2], inputs: Vec<Maps>) -> Vec<Maps> {
     let level = &model.encoders[encoder].levels[level];
     let outputs = inputs.into_iter().map(|x| level.forward(x));
     outputs
         .flat_map(|(skip, below)| std::iter::once(skip).chain(below))
         .collect()
+}
+
+/// `forward` between tensors of Burn, on the operations of the network.
+fn run(model: &Denoiser, forward: Forward, inputs: Vec<Tensor<4>>) -> Vec<Tensor<4>> {
+    let inputs = inputs.into_iter().map(|x| Maps::from_nchw(x, model.ops()));
+    let outputs = forward(model, inputs.collect());
+    outputs.into_iter().map(Maps::into_nchw).collect()
 }
 
 fn in_both_readings(path: &str, forward: Forward) {
@@ -145,7 +155,11 @@ fn check(fixture: &Fixture, reading: Reading, path: &str, forward: Forward) -> S
     let model = network(Variant::Demc, reading, &weights, &device);
     let eval = outputs_close(
         "eval",
-        &forward(&model, fixture.list(&format!("{prefix}/input"), &device)),
+        &run(
+            &model,
+            forward,
+            fixture.list(&format!("{prefix}/input"), &device),
+        ),
     );
 
     let device = device.autodiff();
@@ -155,7 +169,7 @@ fn check(fixture: &Fixture, reading: Reading, path: &str, forward: Forward) -> S
         .into_iter()
         .map(Tensor::require_grad)
         .collect();
-    let outputs = forward(&model, inputs.clone());
+    let outputs = run(&model, forward, inputs.clone());
     let train = outputs_close("train", &outputs);
 
     let probes = fixture.list(&format!("{prefix}/probe"), &device);

@@ -2,7 +2,8 @@
 //! steps of Adam. No Python is needed here; `tests/parity/make_fixtures.py` makes the fixtures, in float64, so the
 //! deviations are those of this side. `parity_live.rs` compares with a PyTorch that is there.
 //!
-//! `DEMC_DEVICE` names the device (default `flex`), so the same numbers are asked of every backend that was built.
+//! `DEMC_DEVICE` names the device (default `flex`) and `DEMC_OPS` the operations (default `kernels`), so the same numbers are
+//! asked of every backend that was built.
 
 mod blocks;
 mod fixture;
@@ -14,6 +15,10 @@ use tensors::Tolerance;
 
 /// The device under test.
 pub fn device() -> Device {
+    if let Ok(name) = std::env::var("DEMC_OPS") {
+        let ops = name.parse();
+        demc_model::ops::set_default(ops.unwrap_or_else(|error| panic!("{error}")));
+    }
     let name = std::env::var("DEMC_DEVICE").unwrap_or_else(|_| "flex".into());
     demc_infer::device::parse(&name).unwrap_or_else(|error| panic!("{error}"))
 }

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use burn::optim::{AdamConfig, GradientsParams};
 use burn::tensor::{Device, Tensor};
-use demc_model::metrics::{LOSS_EPSILON, hdr_from_gamma, rel_mse};
-use demc_model::{Denoiser, Reading, Variant};
+use demc_model::metrics::{LOSS_EPSILON, loss};
+use demc_model::{Denoiser, Ops, Reading, Variant, ops};
 
 use crate::fixture::{
     Fixture, gradients_by_name, host, is_bias_before_norm, network, network_name,
@@ -22,6 +22,14 @@ const ADAM: Tolerance = Tolerance {
     absolute: 1e-4,
     of_largest: 0.0,
     of_value: 0.0,
+};
+
+/// Where the gradient is exactly 0, as it is for some weights on the deepest maps of 2x2 pixels, the kernels' weight gradient
+/// (Winograd's, a sum that cancels) leaves 1e-9, of which Adam's epsilon of 1e-8 makes a step: measured 6e-4, and 1e-3 where
+/// that turned a pixel on or off. So this is loose, and Burn's operations take the same steps within [`ADAM`].
+const ADAM_ON_KERNELS: Tolerance = Tolerance {
+    absolute: 3e-3,
+    ..ADAM
 };
 
 /// A bias before a batch normalisation has no gradient but noise, which Adam blows up to a step of up to one learning rate.
@@ -59,12 +67,9 @@ impl Batch {
         model.forward(self.color_gamma.clone(), self.features_z.clone())
     }
 
-    fn loss(&self, output: Tensor<4>) -> Tensor<1> {
-        rel_mse(
-            hdr_from_gamma(output, 2.2),
-            self.reference_hdr.clone(),
-            LOSS_EPSILON,
-        )
+    fn loss(&self, ops: Ops, output: Tensor<4>) -> Tensor<1> {
+        let reference_hdr = self.reference_hdr.clone();
+        loss(ops, output, reference_hdr, 2.2, LOSS_EPSILON)
     }
 }
 
@@ -108,9 +113,19 @@ fn check(variant: Variant, reading: Reading) {
     let model = network(variant, reading, &fixture, &device);
     let train = check_first_step(&model, &batch, reading, &fixture);
 
-    // A model of its own: the forward pass above has moved the running statistics of the first.
-    let model = network(variant, reading, &fixture, &device);
-    let adam = check_adam(model, &batch, reading, &fixture);
+    // Models of their own: the forward pass above has moved the running statistics of the first.
+    let stepped = |ops| {
+        let model = network(variant, reading, &fixture, &device).with_ops(ops);
+        check_adam(model, &batch, reading, &fixture)
+    };
+    let adam = match ops::process_default().on(&device) {
+        Ops::Kernels => format!(
+            "{}, on kernels: {}",
+            stepped(Ops::Burn),
+            stepped(Ops::Kernels)
+        ),
+        Ops::Burn => stepped(Ops::Burn),
+    };
     println!("{name}: shares of the tolerances: eval {eval:.3}, {train}, {adam}");
 }
 
@@ -133,7 +148,7 @@ fn check_first_step(
     fixture: &Fixture,
 ) -> String {
     let output = batch.output(model);
-    let loss = batch.loss(output.clone());
+    let loss = batch.loss(model.ops(), output.clone());
     let output_share = assert_close(
         "output",
         &host(output),
@@ -180,7 +195,7 @@ fn check_adam(mut model: Denoiser, batch: &Batch, reading: Reading, fixture: &Fi
         .with_epsilon(1e-8)
         .init();
     for _ in 0..STEPS {
-        let gradients = batch.loss(batch.output(&model)).backward();
+        let gradients = batch.loss(model.ops(), batch.output(&model)).backward();
         let gradients = GradientsParams::from_grads(gradients, &model);
         model = adam.step(LEARNING_RATE, model, gradients);
     }
@@ -191,6 +206,10 @@ fn check_adam(mut model: Denoiser, batch: &Batch, reading: Reading, fixture: &Fi
         .collect();
     let expected = fixture.group("adam/");
     assert_eq!(found.len(), expected.len(), "number of weights");
+    let adam_tolerance = match model.ops().on(&crate::device()) {
+        Ops::Kernels => ADAM_ON_KERNELS,
+        Ops::Burn => ADAM,
+    };
     let [mut worst, mut worst_mean] = [0.0f32; 2];
     for weight in expected {
         let what = format!("{} after {STEPS} steps", weight.name);
@@ -200,7 +219,7 @@ fn check_adam(mut model: Denoiser, batch: &Batch, reading: Reading, fixture: &Fi
         } else if weight.name.ends_with("running_mean") {
             worst_mean = worst_mean.max(close(RUNNING_MEAN));
         } else {
-            worst = worst.max(close(ADAM));
+            worst = worst.max(close(adam_tolerance));
         }
     }
     format!("Adam {worst:.3}, running means {worst_mean:.3}")
