@@ -4,9 +4,11 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData, TensorReadError};
 use demc_data::frame::FEATURE_NAMES;
 use demc_data::{FEATURES, Frame};
+use demc_model::Ops;
 use demc_model::config::COLOR_CHANNELS;
 
 use crate::Bundle;
+use crate::memory::{self, TooLarge};
 use crate::padding::Padding;
 
 /// How many training deviations a feature channel may lie from the training mean, root mean square over its pixels.
@@ -37,6 +39,14 @@ pub enum DenoiseError {
         width: usize,
         /// The frame's height in pixels.
         height: usize,
+    },
+    /// The image does not fit into memory.
+    #[error("{name}")]
+    Memory {
+        /// The frame.
+        name: String,
+        /// What it needs and what there is.
+        source: TooLarge,
     },
     /// A feature channel is nowhere near what the network was trained on: another unit, or another buffer.
     #[error(
@@ -87,10 +97,12 @@ impl Bundle {
     /// Returns planar `[3, H, W]` in linear HDR, not negative.
     ///
     /// # Errors
-    /// As [`check_statistics`](Self::check_statistics); a device that fails, an output that is not finite.
+    /// As [`check_statistics`](Self::check_statistics); an image that is too large for the memory that is there; a device
+    /// that fails, an output that is not finite.
     pub fn denoise(&self, frame: &Frame) -> Result<Vec<f32>, DenoiseError> {
         let padding = padding(frame)?;
         self.check_statistics(frame)?;
+        self.check_memory(frame, padding)?;
         let mut color_gamma = frame.color.clone();
         self.meta.normalizer.color_gamma_from_hdr(&mut color_gamma);
         let device = self.device();
@@ -152,6 +164,24 @@ impl Bundle {
             }
         }
         Ok(())
+    }
+
+    /// Refuses a frame that needs more memory than there is, where both are known.
+    fn check_memory(&self, frame: &Frame, padding: Padding) -> Result<(), DenoiseError> {
+        let model = &self.model;
+        let available = match model.ops().on(&self.device()) {
+            Ops::Kernels => memory::available(),
+            Ops::Burn => None,
+        };
+        let (height, width) = (padding.padded_height(), padding.padded_width());
+        available
+            .map_or(Ok(()), |bytes| {
+                memory::check(model.config(), height, width, bytes)
+            })
+            .map_err(|source| DenoiseError::Memory {
+                name: frame.name.clone(),
+                source,
+            })
     }
 
     /// Z-scored, padded features on the model's device, `[1, 12, padded H, padded W]`.

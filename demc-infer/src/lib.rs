@@ -11,6 +11,7 @@ pub mod compute;
 pub mod denoise;
 pub mod device;
 pub mod evaluate;
+pub mod memory;
 pub mod padding;
 pub mod picture;
 

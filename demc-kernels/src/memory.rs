@@ -228,6 +228,11 @@ pub fn buffer(len: usize) -> Vec<f32> {
     unsafe { recycled(len) }.unwrap_or_else(|| vec![0.0; len])
 }
 
+/// Bytes of free memory that is kept for the next large blocks.
+pub fn kept_bytes() -> usize {
+    kept().bytes
+}
+
 /// Bytes in large blocks that the process uses, and the most that it used at a time; 0 where [`Recycler`] is not its
 /// allocator.
 pub fn used() -> [usize; 2] {

@@ -1,6 +1,6 @@
 //! How much memory a pass takes, told before it runs.
 
-use demc_kernels::Grid;
+use demc_kernels::{Grid, memory};
 
 use super::Plan;
 use super::encoder::{DEEPEST_BANDED, LEVELS_IN_STEP};
@@ -41,6 +41,11 @@ pub fn peak_bytes(config: &ModelConfig, height: usize, width: usize) -> u64 {
     let pass = Pass { config, plan, grid };
     let values = pass.encoders().max(pass.decoder());
     (values * VALUE) as u64
+}
+
+/// Bytes that this process holds, does not use, and will use for its next images before it asks the system for more.
+pub fn reusable_bytes() -> u64 {
+    memory::kept_bytes() as u64
 }
 
 /// A pass through the network; all sizes in values.

@@ -32,7 +32,7 @@ use crate::ops::Ops;
 use band::TILE_ROWS;
 use layer::Layer;
 
-pub use estimate::peak_bytes;
+pub use estimate::{peak_bytes, reusable_bytes};
 
 /// Pixels of the full resolution in a band, for each thread: enough work to wake threads for, little enough for caches.
 const BAND_PIXELS: usize = 20 << 10;

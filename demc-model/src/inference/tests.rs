@@ -106,7 +106,7 @@ fn an_image_in_a_batch_is_the_image_alone() {
     let model = network(Variant::Demc, Reading::Paper);
     let size = [2, 96, 64];
     let both = run(&model, size, Tile::F4, 8);
-    let [color, features] = images(size).map(|images| images.slice([1..2]));
+    let [color, features] = images(size).map(|images| images.narrow(0, 1, 1));
     let out = forward_with(&model, color, features, Tile::F4, plan(8));
     let second: Vec<f32> = out.into_data().try_to_vec().expect("float32");
     assert!(both[second.len()..] == second);
