@@ -156,7 +156,7 @@ mod tests {
         let available = 1 << 30;
         let error = check(&config, 2176, 3840, available).expect_err("a GiB is not enough");
         let side = error.tile.expect("a tile");
-        assert!(side % DOWNSAMPLING == 0 && peak_bytes(&config, side, side) <= available);
+        assert!(side.is_multiple_of(DOWNSAMPLING) && peak_bytes(&config, side, side) <= available);
         let next = side + DOWNSAMPLING;
         assert!(peak_bytes(&config, next, next) > available);
         let needed = needed.div_ceil(1 << 20);
