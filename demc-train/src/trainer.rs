@@ -218,4 +218,25 @@ mod tests {
         assert_eq!(step(&clipped_config), step(&config(2, 1)));
         assert!(step(&clipped_config).grad_norm > 1e-3);
     }
+
+    /// On the kernels a step writes weights where they lie: had anything kept a reference to one (the graph, a copy of the
+    /// network), it would have been copied.
+    #[test]
+    fn a_step_on_kernels_leaves_weights_in_their_place() {
+        use burn::backend::Flex;
+        use burn::tensor::Tensor;
+        let config = config(2, 1);
+        let mut trainer = trainer(&config);
+        let place = |trainer: &Trainer| {
+            let conv = &trainer.model().encoders[0].levels[2].convs[1];
+            let weight: Tensor<4> = conv.weight.val().inner();
+            let weight = weight.try_into_primitive::<Flex>().expect("flex");
+            weight.bytes().as_ptr() as usize
+        };
+        let before = place(&trainer);
+        for _ in 0..2 {
+            let Ok(_) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
+            assert_eq!(place(&trainer), before);
+        }
+    }
 }
