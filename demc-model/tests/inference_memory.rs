@@ -23,7 +23,7 @@ fn the_estimate_is_what_a_pass_allocates() {
     let cases = [
         (Variant::Demc, Reading::Paper, 24, [512, 512]),
         (Variant::DemcNosn, Reading::Paper, 24, [1024, 512]),
-        (Variant::Demc, Reading::Released, 24, [768, 768]),
+        (Variant::Demc, Reading::Released, 24, [768, 1024]),
         (Variant::Semc, Reading::Paper, 32, [736, 1280]),
         (Variant::Demc, Reading::Paper, 32, [1088, 1920]),
     ];

@@ -73,6 +73,12 @@ impl Stream {
         &self.values[(self.rows - rows) * row..self.rows * row]
     }
 
+    /// The last `rows`, to be written again.
+    pub(super) fn last_mut(&mut self, rows: usize) -> &mut [f32] {
+        let row = self.width * self.channels;
+        &mut self.values[(self.rows - rows) * row..self.rows * row]
+    }
+
     /// All that are there, and their grid.
     pub(super) fn all(&self) -> (Grid, &[f32]) {
         let grid = Grid {

@@ -1,18 +1,22 @@
-//! The decoder: each level in bands, in place of the skips' share of its fusion.
+//! The decoder: each level in place of the skips' share of its fusion, of large ones only a band not yet fused. The last
+//! level of a large image is `step`'s.
 
 use demc_kernels::conv1x1::{self, Finish};
-use demc_kernels::{Grid, conv3x3, deconv4x4, memory};
+use demc_kernels::{Grid, deconv4x4, grid, memory};
 
 use super::encoder::{Encoded, bands};
 use super::layer::Layer;
 use super::{Maps, Run};
-use crate::config::COLOR_CHANNELS;
 use crate::decoder::DecoderLevel;
 
 impl Run<'_> {
     /// Planar images `[B, 3, H, W]` from what the encoders left.
     pub(super) fn decode(&self, encoded: Encoded) -> Vec<f32> {
-        let Encoded { sums, bottom } = encoded;
+        let Encoded {
+            sums,
+            again,
+            bottom,
+        } = encoded;
         let latent = &self.model.latent;
         let mut x = self.conv3x3(&bottom, &Layer::conv(&latent.conv, latent.norm.as_ref()));
         drop(bottom);
@@ -20,7 +24,15 @@ impl Run<'_> {
         for (level, sum) in decoder.levels.iter().zip(sums.into_iter().rev()) {
             x = self.ascend(level, &x, sum);
         }
-        self.head(&x, &Layer::conv(&decoder.head, None))
+        match again {
+            Some(again) => self.finish_in_step(&x, again),
+            None => {
+                let image = self.conv3x3(&x, &Layer::conv(&decoder.head, None));
+                let mut planar = memory::buffer(image.values.len());
+                grid::nchw_from_nhwc(image.grid, &image.values, &mut planar);
+                planar
+            }
+        }
     }
 
     /// A level: `sum` is the skips' share of its fusion and becomes its output.
@@ -56,34 +68,5 @@ impl Run<'_> {
             }
         }
         sum
-    }
-
-    /// The output convolution, planar.
-    fn head(&self, x: &Maps, layer: &Layer) -> Vec<f32> {
-        let Grid { height, width, .. } = x.grid;
-        let (weight, bias) = (layer.weight(), layer.bias());
-        let conv = conv3x3::Ready::new(self.isa, self.tile, weight, bias, true);
-        let mut planar = memory::buffer(x.grid.pixels() * COLOR_CHANNELS);
-        let band = self.plan.band_rows(x.grid);
-        let mut colors = memory::buffer(band * width * COLOR_CHANNELS);
-        for (image, planar) in planar
-            .chunks_exact_mut(height * width * COLOR_CHANNELS)
-            .enumerate()
-        {
-            for rows in bands(height, band) {
-                let (window, above) = x.with_neighbours(rows.clone());
-                let colors = &mut colors[..rows.len() * width * COLOR_CHANNELS];
-                let grid = x.band(window.len());
-                conv.forward(grid, x.rows(image, window), above, colors);
-                for (channel, plane) in planar.chunks_exact_mut(height * width).enumerate() {
-                    let plane = &mut plane[rows.start * width..rows.end * width];
-                    let colors = colors.chunks_exact(COLOR_CHANNELS);
-                    for (to, color) in plane.iter_mut().zip(colors) {
-                        *to = color[channel];
-                    }
-                }
-            }
-        }
-        planar
     }
 }

@@ -3,8 +3,11 @@
 use demc_kernels::{Grid, memory};
 
 use super::Plan;
-use super::encoder::{DEEPEST_BANDED, LEVELS_IN_STEP};
-use crate::config::{COLOR_CHANNELS, FEATURE_CHANNELS, LEVELS, ModelConfig};
+use super::encoder::DEEPEST_BANDED;
+use super::step::LEVELS_IN_STEP;
+use crate::config::{
+    COLOR_CHANNELS, DETAIL_CHANNELS, FEATURE_CHANNELS, Input, LEVELS, ModelConfig,
+};
 
 /// Bytes of a value.
 const VALUE: usize = size_of::<f32>();
@@ -26,8 +29,8 @@ const WAITING_ROWS: usize = 5;
 ///
 /// The pass is a sequence of phases; each holds some maps, the prepared weights of some convolutions and what threads
 /// work in, and the largest counts. With `P` pixels, base width `C` and large images nearly all of it are the skips'
-/// shares of the fusions, `C * P * (1 + 1/2 + 1/4 + 1/8 + 1/32)` values, and the images' `15 * P`. It grows a little with
-/// the number of threads, whose bands are larger.
+/// shares of the fusions, `C * P * (1/2 + 1/4 + 1/8 + 1/32)` values, and the images, `6 * P` to `18 * P`. It grows a
+/// little with the number of threads, whose bands are larger.
 ///
 /// # Panics
 /// Where `height` and `width` are no multiples of 32.
@@ -94,8 +97,37 @@ impl Pass<'_> {
         self.grid.pixels() * (COLOR_CHANNELS + FEATURE_CHANNELS)
     }
 
-    /// The shares of the fusions down to a level.
+    fn has_fusion(&self) -> bool {
+        self.config.variant.spec().has_fusion()
+    }
+
+    /// The detail map, where there is one.
+    fn detail(&self) -> usize {
+        match self.has_fusion() {
+            true => self.grid.pixels() * DETAIL_CHANNELS,
+            false => 0,
+        }
+    }
+
+    /// What the first level's skips are computed from once more.
+    fn kept(&self) -> usize {
+        if !self.plan.is_banded(self.grid) {
+            return 0;
+        }
+        let inputs = self.config.variant.spec().encoders.concat();
+        let features = inputs.contains(&Input::Features);
+        let images = if features {
+            self.images()
+        } else {
+            self.grid.pixels() * COLOR_CHANNELS
+        };
+        images + self.detail()
+    }
+
+    /// The shares of some levels' fusions; the first level's is not kept of a large image.
     fn sums(&self, levels: std::ops::Range<usize>) -> usize {
+        let first = usize::from(self.plan.is_banded(self.grid));
+        let levels = levels.filter(|level| *level >= first);
         levels.map(|level| self.map(level)).sum()
     }
 
@@ -131,7 +163,8 @@ impl Pass<'_> {
     fn encoders(&self) -> usize {
         let count = self.encoder_count();
         let banded = |level| self.plan.is_banded(self.grid_of(level));
-        let (first, mut most) = if banded(0) {
+        let in_step = banded(0);
+        let (first, mut most) = if in_step {
             let waiting: usize = (0..LEVELS_IN_STEP)
                 .map(|level| {
                     let convolutions = self.config.reading.spec().convolutions[level];
@@ -141,17 +174,17 @@ impl Pass<'_> {
             let below = self.input(LEVELS_IN_STEP);
             // A band in and out of a convolution.
             let bands = 2 * self.rows(0, self.plan.band + 2 * WAITING_ROWS);
-            let sums = self.sums(0..LEVELS_IN_STEP);
-            let held = self.images() + sums + bands;
+            let sums = self.sums(1..LEVELS_IN_STEP);
+            let held = self.images() + self.detail() + sums + bands;
             (LEVELS_IN_STEP, held + count * (waiting + below))
-        } else if self.config.variant.spec().has_fusion() {
+        } else if self.has_fusion() {
             let fusion = 2 * self.map(0) + self.weights(0, false);
             (0, self.images() + fusion)
         } else {
             (0, self.images() + count * self.input(0))
         };
         for level in first..LEVELS {
-            let held = self.sums(0..level + 1) + count * self.input(level);
+            let held = self.kept() + self.sums(0..level + 1) + count * self.input(level);
             let grid = self.grid_of(level);
             let works = if level <= DEEPEST_BANDED && banded(level) {
                 let bands = 3 * self.rows(level, self.plan.band + 2 * WAITING_ROWS);
@@ -173,17 +206,11 @@ impl Pass<'_> {
         let deepest = self.channels(LEVELS - 1);
         let latent = PLACES * deepest * deepest + self.scratch(deepest, deepest, bottom / deepest);
         let mut most = all + 2 * bottom + latent;
-        for level in (0..LEVELS).rev() {
+        let in_step = self.plan.is_banded(self.grid);
+        for level in (usize::from(in_step)..LEVELS).rev() {
             let grid = self.grid_of(level);
-            let (to, from) = match level {
-                4 => (deepest, deepest),
-                _ => (self.channels(level), self.channels(level + 1)),
-            };
-            let below = if level + 1 < LEVELS {
-                self.map(level + 1)
-            } else {
-                bottom
-            };
+            let (to, below) = (self.channels(level), self.below(level));
+            let from = self.channels((level + 1).min(LEVELS - 1));
             let share = match self.plan.is_banded(grid) {
                 true => self.plan.band as f64 / grid.height as f64,
                 false => 1.0,
@@ -193,12 +220,22 @@ impl Pass<'_> {
             most = most.max(self.sums(0..level + 1) + below + works + 16 * from * to);
         }
         let output = self.grid.pixels() * COLOR_CHANNELS;
-        // The head's products: 9 values an output, in whole vectors.
-        let share = match self.plan.is_banded(self.grid) {
-            true => self.plan.band,
-            false => self.grid.height,
+        let last = match in_step {
+            true => {
+                let waiting = self.encoder_count() * self.weights(0, false);
+                self.below(0) + waiting + 3 * self.rows(0, self.plan.band + 2 * WAITING_ROWS)
+            }
+            // The head's products: 9 values an output, in whole vectors.
+            false => self.map(0) + self.grid.pixels() * (32 + COLOR_CHANNELS),
         };
-        let head = share * self.grid.width * (32 + COLOR_CHANNELS);
-        most.max(self.map(0) + output + head)
+        self.kept() + most.max(output + last)
+    }
+
+    /// What the decoder has below a level.
+    fn below(&self, level: usize) -> usize {
+        match level + 1 {
+            LEVELS => self.map(LEVELS - 1) / 4,
+            below => self.map(below),
+        }
     }
 }

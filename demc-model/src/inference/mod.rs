@@ -8,13 +8,16 @@
 //!   are there, into one map of the level's width; no skip lives on until the decoder, which adds its own share in place.
 //! - Large maps come in bands of rows (`band`): the fusion sub-network and the encoders' upper levels hand theirs on
 //!   while they are still in a cache, and of a decoder's level only a band is not yet fused (`encoder`, `decoder`).
+//! - No map of a large image's full resolution is ever whole but three channels in, three between and three out (`step`).
 //! - 3x3 convolutions multiply four times less than the plain sum (Winograd, F(4x4, 3x3)).
 
 mod band;
 mod decoder;
 mod encoder;
 mod estimate;
+mod images;
 mod layer;
+mod step;
 #[cfg(test)]
 mod tests;
 
@@ -30,6 +33,7 @@ use crate::config::COLOR_CHANNELS;
 use crate::denoiser::Denoiser;
 use crate::ops::Ops;
 use band::TILE_ROWS;
+use images::Images;
 use layer::Layer;
 
 pub use estimate::{peak_bytes, reusable_bytes};
@@ -72,24 +76,9 @@ fn forward_with(
         plan,
         model,
     };
-    let images = Images {
-        grid: Grid {
-            batch,
-            height,
-            width,
-        },
-        planar: [color_gamma, features_z].map(host),
-    };
-    let out = run.decode(run.encode(images));
+    let out = run.decode(run.encode(Images::new(color_gamma, features_z)));
     let shape = [batch, COLOR_CHANNELS, height, width];
     Tensor::from_primitive::<Flex>(FlexTensor::from_data(TensorData::new(out, shape)))
-}
-
-fn host(tensor: Tensor<4>) -> FlexTensor {
-    let tensor = tensor
-        .try_into_primitive::<Flex>()
-        .expect("an image on flex");
-    tensor.to_contiguous()
 }
 
 /// How an image is cut.
@@ -117,14 +106,6 @@ impl Plan {
     fn is_banded(self, grid: Grid) -> bool {
         grid.height > 2 * self.band
     }
-
-    /// Rows of a band of maps on `grid`: all where they do not come in bands.
-    fn band_rows(self, grid: Grid) -> usize {
-        match self.is_banded(grid) {
-            true => self.band,
-            false => grid.height,
-        }
-    }
 }
 
 /// One pass through the network.
@@ -142,22 +123,6 @@ impl Run<'_> {
         let conv = conv3x3::Ready::new(self.isa, self.tile, layer.weight(), layer.bias(), true);
         conv.forward(x.grid, &x.values, 0, &mut y.values);
         y
-    }
-}
-
-/// What is to be denoised, planar: gamma-compressed colour and Z-scored features.
-struct Images {
-    grid: Grid,
-    planar: [FlexTensor; 2],
-}
-
-impl Images {
-    fn color(&self) -> &[f32] {
-        self.planar[0].storage::<f32>()
-    }
-
-    fn features(&self) -> &[f32] {
-        self.planar[1].storage::<f32>()
     }
 }
 
@@ -182,11 +147,7 @@ impl Maps {
 
     /// The grid of some rows of one image.
     fn band(&self, rows: usize) -> Grid {
-        Grid {
-            batch: 1,
-            height: rows,
-            ..self.grid
-        }
+        band_of(self.grid, rows)
     }
 
     /// Some rows of an image.
@@ -212,5 +173,14 @@ impl Maps {
             start..(rows.end + 1).min(self.grid.height),
             rows.start - start,
         )
+    }
+}
+
+/// The grid of some rows of one image.
+fn band_of(grid: Grid, rows: usize) -> Grid {
+    Grid {
+        batch: 1,
+        height: rows,
+        ..grid
     }
 }
