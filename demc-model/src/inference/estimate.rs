@@ -31,9 +31,7 @@ const WAITING_ROWS: usize = 5;
 /// work in, and the largest counts. With `P` pixels, base width `C` and large images nearly all of it are the skips'
 /// shares of the fusions, `C * P * (1/2 + 1/4 + 1/8 + 1/32)` values, and the images, `6 * P` to `18 * P`. It grows a
 /// little with the number of threads, whose bands are larger.
-///
-/// # Panics
-/// Where `height` and `width` are no multiples of 32.
+/// Both sides are multiples of 32.
 pub fn peak_bytes(config: &ModelConfig, height: usize, width: usize) -> u64 {
     let plan = Plan::new(width);
     let grid = Grid {

@@ -41,6 +41,9 @@ pub use estimate::{peak_bytes, reusable_bytes};
 /// Pixels of the full resolution in a band, for each thread: enough work to wake threads for, little enough for caches.
 const BAND_PIXELS: usize = 20 << 10;
 
+/// Most rows of a band, however many threads there are: a large image is to come in bands on every machine.
+const MOST_ROWS: usize = 256;
+
 /// What a band's rows are a multiple of: a tile at the level below, too.
 const BAND_STEP: usize = 2 * TILE_ROWS;
 
@@ -94,10 +97,9 @@ impl Plan {
     /// For images of this width and the threads at hand.
     fn new(width: usize) -> Self {
         let threads = rayon::current_num_threads();
+        let rows = BAND_PIXELS * threads / width;
         Plan {
-            band: (BAND_PIXELS * threads / width)
-                .next_multiple_of(BAND_STEP)
-                .max(BAND_STEP),
+            band: rows.clamp(1, MOST_ROWS).next_multiple_of(BAND_STEP),
             threads,
         }
     }
