@@ -1,6 +1,6 @@
 //! The 3x3 convolution with padding 1: bias and ReLU fused, and its gradients.
 //!
-//! Wide layers go through [`crate::winograd`], those with few channels on one side through [`crate::thin`].
+//! Wide layers go through `winograd`, those with few channels on one side through `thin`.
 
 use crate::winograd::{self, Finish};
 use crate::{Grid, Isa, thin};

@@ -19,7 +19,6 @@ const TOLERANCE: f64 = 0.1;
 #[test]
 #[cfg(target_os = "linux")]
 fn the_estimate_is_what_a_pass_allocates() {
-    let count = std::env::var("T").map_or(2, |t| t.parse().unwrap());
     let threads = rayon::ThreadPoolBuilder::new().num_threads(2).build();
     threads.expect("threads").install(check);
 }
