@@ -100,7 +100,7 @@ impl How {
 }
 
 fn main() {
-    if let Err(error) = run(Arguments::parse().command) {
+    if let Err(error) = ops::within_pool(|| run(Arguments::parse().command)) {
         eprintln!("error: {error:#}");
         std::process::exit(1);
     }

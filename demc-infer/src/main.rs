@@ -12,7 +12,8 @@ use clap::Parser;
 static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
 
 fn main() -> ExitCode {
-    match cli::run(cli::Arguments::parse()) {
+    let arguments = cli::Arguments::parse();
+    match demc_model::ops::within_pool(|| cli::run(arguments)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");

@@ -33,3 +33,4 @@ mod winograd;
 
 pub use grid::Grid;
 pub use isa::Isa;
+pub use tasks::within_pool;

@@ -7,13 +7,15 @@ use std::process::ExitCode;
 use clap::Parser;
 use demc_infer::compute::IsaError;
 use demc_infer::device::DeviceError;
+use demc_model::ops::within_pool;
 use demc_train::config::ConfigError;
 
 #[global_allocator]
 static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
 
 fn main() -> ExitCode {
-    match cli::run(cli::Arguments::parse()) {
+    let arguments = cli::Arguments::parse();
+    match within_pool(|| cli::run(arguments)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");

@@ -24,6 +24,7 @@ use burn::tensor::{Device, Tensor};
 pub use demc_kernels::Isa;
 pub use demc_kernels::isa::{UnknownIsa, VARIABLE as ISA_VARIABLE};
 pub use demc_kernels::memory::Recycler;
+pub use demc_kernels::within_pool;
 use thiserror::Error;
 
 pub use maps::{Activation, Maps};
