@@ -160,7 +160,7 @@ pub fn write_tensors(
     std::fs::write(path, bytes).with_context(|| path.display().to_string())
 }
 
-/// Reads what [`write`] wrote.
+/// Reads what [`write()`] wrote.
 ///
 /// # Errors
 /// A file that cannot be read or holds something else.
