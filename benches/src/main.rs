@@ -77,7 +77,7 @@ struct Files {
 
 #[derive(Args)]
 struct How {
-    /// Where to compute: flex, ndarray, wgpu[:N], cuda[:N]
+    /// Where to compute: flex, ndarray, `wgpu[:N]`, `cuda[:N]`
     #[arg(long, default_value = "flex")]
     device: String,
     /// Operations on flex: kernels (the project's own) or burn
