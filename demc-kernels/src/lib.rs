@@ -28,8 +28,6 @@ mod simd;
 mod tasks;
 #[cfg(test)]
 mod testing;
-mod thin;
-mod winograd;
 
 pub use grid::Grid;
 pub use isa::Isa;

@@ -8,6 +8,9 @@
 
 use crate::Isa;
 
+/// Values in the widest vector of all paths.
+pub(crate) const WIDEST: usize = 16;
+
 /// A vector type and its operations.
 ///
 /// # Safety

@@ -149,7 +149,11 @@ impl Maps {
 
     /// The grid of some rows of one image.
     fn band(&self, rows: usize) -> Grid {
-        band_of(self.grid, rows)
+        Grid {
+            batch: 1,
+            height: rows,
+            ..self.grid
+        }
     }
 
     /// Some rows of an image.
@@ -175,14 +179,5 @@ impl Maps {
             start..(rows.end + 1).min(self.grid.height),
             rows.start - start,
         )
-    }
-}
-
-/// The grid of some rows of one image.
-fn band_of(grid: Grid, rows: usize) -> Grid {
-    Grid {
-        batch: 1,
-        height: rows,
-        ..grid
     }
 }

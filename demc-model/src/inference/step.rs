@@ -5,14 +5,16 @@
 //! two convolutions of few channels each. Computing them again takes a tenth of the pass's time; keeping them would take a
 //! third of its memory. What they are computed from, three channels a piece, is kept.
 
-use demc_kernels::conv1x1::{self, Finish};
-use demc_kernels::{deconv4x4, memory};
+use std::ops::Range;
+
+use demc_kernels::{Grid, memory};
 
 use super::band::Chain;
+use super::decoder::level_layers;
 use super::encoder::{Level, bands, block_layer};
 use super::images::Images;
 use super::layer::Layer;
-use super::{Maps, Run, band_of};
+use super::{Maps, Run};
 use crate::config::{COLOR_CHANNELS, DETAIL_CHANNELS, Input};
 
 /// Levels that the rows of the images run through at once. Their weights are ready at the same time; those of a deeper
@@ -111,9 +113,9 @@ impl Run<'_> {
         let (grid, inputs) = (images.grid, self.inputs_of_encoders());
         let decoder = &self.model.decoder;
         let level = decoder.levels.last().expect("a decoder of LEVELS levels");
-        let layer = Layer::deconv(&level.deconv, level.norm.as_ref());
-        let deconv = deconv4x4::Ready::new(self.isa, layer.weight(), layer.bias(), true);
-        let fuse = self.fuse(0);
+        let fusion = level_layers(level);
+        let ascent = self.ascent(level, &fusion);
+        let [_, fuse] = &fusion;
         let head = [Layer::conv(&decoder.head, None)];
         let mut head = self.chain(&head, grid);
         let layers: Vec<Vec<Layer>> = self
@@ -153,37 +155,30 @@ impl Run<'_> {
                         0 => head.input().push(made.len()),
                         _ => head.input().last_mut(made.len()),
                     };
-                    self.add_skip(index, band, skip, &fuse, sum);
+                    self.add_skip(index, band, skip, fuse, sum);
                     chain.output.forget();
                 }
                 if made.is_empty() {
                     continue;
                 }
-                let mut decoded = memory::buffer(made.len() * grid.width * layer.outputs());
-                let (window, above) = below.with_neighbours(made.start / 2..made.end / 2);
-                let x = below.rows(image, window.clone());
-                deconv.forward(below.band(window.len()), x, above, &mut decoded);
-                let finish = Finish {
-                    bias: Some(fuse.bias()),
-                    relu: level.activated_fusion,
-                    add: true,
-                };
                 let sum = head.input().last_mut(made.len());
-                let band = band_of(grid, made.len());
-                conv1x1::part(self.isa, band, &[&decoded], fuse.weight(), 0, finish, sum);
-                drop(decoded);
-                head.advance(|_, rows, colors| {
-                    for (channel, plane) in planar.chunks_exact_mut(plane).enumerate() {
-                        let plane = &mut plane[rows.start * grid.width..rows.end * grid.width];
-                        let colors = colors.chunks_exact(COLOR_CHANNELS);
-                        for (to, color) in plane.iter_mut().zip(colors) {
-                            *to = color[channel];
-                        }
-                    }
-                });
+                ascent.finish_rows(below, image, made, sum);
+                head.advance(|_, rows, colors| put_rows(planar, grid, rows, colors));
                 head.output.forget();
             }
         }
         planar
+    }
+}
+
+/// Puts rows of an image's colours, channels last, to their places in its planes.
+fn put_rows(planar: &mut [f32], grid: Grid, rows: Range<usize>, colors: &[f32]) {
+    let planes = planar.chunks_exact_mut(grid.height * grid.width);
+    for (channel, plane) in planes.enumerate() {
+        let plane = &mut plane[rows.start * grid.width..rows.end * grid.width];
+        let colors = colors.chunks_exact(COLOR_CHANNELS);
+        for (to, color) in plane.iter_mut().zip(colors) {
+            *to = color[channel];
+        }
     }
 }

@@ -2,8 +2,14 @@
 //!
 //! Wide layers go through `winograd`, those with few channels on one side through `thin`.
 
-use crate::winograd::{self, Finish};
-use crate::{Grid, Isa, thin};
+mod parts;
+#[cfg(test)]
+mod tests;
+mod thin;
+mod winograd;
+
+use crate::{Grid, Isa};
+use parts::{Axes, Finish};
 
 /// Tiles of the Winograd transforms.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -148,7 +154,7 @@ impl<'a> Ready<'a> {
         );
         match &self.weights {
             Weights::Thin(weight) => {
-                let axes = thin::Axes::new(self.outputs, self.inputs, false);
+                let axes = Axes::new(self.outputs, self.inputs, false);
                 thin::convolve(self.isa, grid, x, None, above, weight, axes, self.finish, y);
             }
             Weights::F2(weights) => {
@@ -201,7 +207,7 @@ pub fn backward(
         winograd::gradient::<TILE>(isa, grid, x, dy, y, dweight, dbias);
     } else {
         if let Some(dx) = dx {
-            let axes = thin::Axes::new(outputs, inputs, true);
+            let axes = Axes::new(outputs, inputs, true);
             thin::convolve(isa, grid, dy, y, 0, weight, axes, nothing, dx);
         }
         thin::gradient(isa, grid, x, dy, y, dweight, dbias);
@@ -222,140 +228,4 @@ fn check(grid: Grid, x: usize, weight: usize, outputs: usize, y: usize) -> (usiz
         "a weight of {inputs} to {outputs} channels"
     );
     (inputs, outputs)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::reference;
-    use crate::testing::{assert_close, f64s, few, grids, pattern};
-
-    #[test]
-    fn equals_the_reference_on_every_path_at_odd_sizes() {
-        for isa in Isa::available() {
-            for (case, grid) in grids().into_iter().enumerate() {
-                let cases = vec![
-                    (3, 8),
-                    (8, 8),
-                    (9, 3),
-                    (12, 5),
-                    (1, 1),
-                    (17, 33),
-                    (20, 8),
-                    (66, 16),
-                ];
-                for (inputs, outputs) in few(cases, 2) {
-                    let x = pattern(grid.pixels() * inputs, 1 + case as u32);
-                    let weight = pattern(outputs * inputs * 9, 2);
-                    let bias = pattern(outputs, 3);
-                    let dy = pattern(grid.pixels() * outputs, 4);
-                    for relu in [false, true] {
-                        let name = format!("{isa} {grid:?} {inputs} to {outputs}");
-                        let mut y = vec![f32::NAN; dy.len()];
-                        forward(isa, grid, &x, &weight, &bias, relu, &mut y);
-                        let expected =
-                            reference::conv3x3(grid, &f64s(&x), &f64s(&weight), &f64s(&bias), relu);
-                        assert_close(&format!("{name} y"), &y, &expected);
-
-                        let gate = relu.then_some(&y[..]);
-                        let gated = match gate {
-                            Some(y) => reference::gated(&f64s(&dy), &f64s(y)),
-                            None => f64s(&dy),
-                        };
-                        let expected =
-                            reference::conv3x3_backward(grid, &f64s(&x), &f64s(&weight), &gated);
-                        let mut dx = vec![f32::NAN; x.len()];
-                        let mut dweight = vec![f32::NAN; weight.len()];
-                        let mut dbias = vec![f32::NAN; outputs];
-                        backward(
-                            isa,
-                            grid,
-                            &x,
-                            &weight,
-                            gate,
-                            &dy,
-                            Some(&mut dx),
-                            &mut dweight,
-                            &mut dbias,
-                        );
-                        assert_close(&format!("{name} dx"), &dx, &expected.dx);
-                        assert_close(&format!("{name} dweight"), &dweight, &expected.dweight);
-                        assert_close(&format!("{name} dbias"), &dbias, &expected.dbias);
-                    }
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn bands_of_rows_are_the_whole() {
-        let grid = Grid {
-            batch: 1,
-            height: 23,
-            width: 9,
-        };
-        for isa in Isa::available() {
-            for (inputs, outputs) in [(3, 20), (20, 3), (18, 33)] {
-                let (x, weight) = (
-                    pattern(grid.pixels() * inputs, 1),
-                    pattern(outputs * inputs * 9, 2),
-                );
-                let bias = pattern(outputs, 3);
-                for tile in [Tile::F2, Tile::F4] {
-                    let mut whole = vec![f32::NAN; grid.pixels() * outputs];
-                    forward_with(isa, tile, grid, &x, &weight, &bias, true, &mut whole);
-                    let ready = Ready::new(isa, tile, &weight, &bias, true);
-                    let mut bands = vec![f32::NAN; whole.len()];
-                    for (first, end) in [(0, 4), (4, 16), (16, 23)] {
-                        let (from, to) =
-                            (usize::saturating_sub(first, 1), (end + 1).min(grid.height));
-                        let row = grid.width * inputs;
-                        let y =
-                            &mut bands[first * grid.width * outputs..end * grid.width * outputs];
-                        let band = Grid {
-                            height: to - from,
-                            ..grid
-                        };
-                        ready.forward(band, &x[from * row..to * row], first - from, y);
-                    }
-                    let differs = |i: &usize| bands[*i].to_bits() != whole[*i].to_bits();
-                    let at = (0..whole.len())
-                        .find(differs)
-                        .map(|i| (i / outputs, bands[i], whole[i]));
-                    assert!(
-                        at.is_none(),
-                        "{isa} {inputs} to {outputs} {tile:?}: pixel, found, expected: {at:?}"
-                    );
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn larger_tiles_keep_1e_4() {
-        for isa in Isa::available() {
-            for grid in grids() {
-                let (inputs, outputs) = if cfg!(miri) { (9, 8) } else { (64, 17) };
-                let x = pattern(grid.pixels() * inputs, 1);
-                let weight = pattern(outputs * inputs * 9, 2);
-                let bias = pattern(outputs, 3);
-                let weights = winograd::Weights::new::<6>(isa, &weight, outputs, inputs, false);
-                let mut y = vec![f32::NAN; grid.pixels() * outputs];
-                winograd::convolve::<6>(
-                    grid,
-                    &x,
-                    None,
-                    &weights,
-                    Finish {
-                        bias: Some(&bias),
-                        relu: true,
-                    },
-                    &mut y,
-                );
-                let expected =
-                    reference::conv3x3(grid, &f64s(&x), &f64s(&weight), &f64s(&bias), true);
-                crate::testing::assert_within(&format!("{isa} {grid:?}"), &y, &expected, 2e-5);
-            }
-        }
-    }
 }

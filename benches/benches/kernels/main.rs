@@ -11,12 +11,13 @@
 //! Burn, the copy one of 64 MiB by all threads. A convolution that saves multiplications (Winograd) counts as if it made
 //! all of them, so its share can be above 100 %.
 
-use burn::tensor::{Device, Distribution, Tensor};
-use demc_bench::stopwatch::{Spread, interleaved, turn};
+mod peak;
+
+use demc_bench::stopwatch::{Spread, interleaved};
 use demc_kernels::{Grid, Isa, adam, batch_norm, conv1x1, conv3x3, deconv4x4, grid, pool, rel_mse};
+use peak::Peak;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rayon::prelude::*;
 
 /// That of the binaries.
 #[global_allocator]
@@ -81,75 +82,6 @@ impl Options {
             }
         }
         options
-    }
-}
-
-/// What the machine can do, and the means to ask it again.
-struct Peak {
-    side: usize,
-    flops: f64,
-    bytes: f64,
-    a: Tensor<2>,
-    b: Tensor<2>,
-    from: Vec<f32>,
-    to: Vec<f32>,
-}
-
-impl Peak {
-    fn measure() -> Self {
-        let device = Device::flex();
-        let square = |side| Tensor::random([side, side], Distribution::Default, &device);
-        let rate = |side: usize| {
-            let (a, b) = (square(side), square(side));
-            let mut product = || drop(std::hint::black_box(a.clone().matmul(b.clone())));
-            product();
-            let seconds = (0..5)
-                .map(|_| turn(&mut product))
-                .fold(f64::INFINITY, f64::min);
-            (2.0 * (side as f64).powi(3) / seconds, side)
-        };
-        let (flops, side) = [512, 1024, 2048]
-            .map(rate)
-            .into_iter()
-            .fold((0.0, 0), |a, b| if a.0 > b.0 { a } else { b });
-        let (from, to) = (vec![1.0; 1 << 24], vec![0.0; 1 << 24]);
-        let mut peak = Peak {
-            side,
-            flops,
-            bytes: 0.0,
-            a: square(side),
-            b: square(side),
-            from,
-            to,
-        };
-        peak.copy();
-        let seconds = (0..5)
-            .map(|_| turn(&mut || peak.copy()))
-            .fold(f64::INFINITY, f64::min);
-        peak.bytes = peak.copied() / seconds;
-        peak
-    }
-
-    fn product(&self) {
-        drop(std::hint::black_box(self.a.clone().matmul(self.b.clone())));
-    }
-
-    /// Floating point operations of [`Self::product`].
-    fn operations(&self) -> f64 {
-        2.0 * (self.side as f64).powi(3)
-    }
-
-    fn copy(&mut self) {
-        let chunk = 1 << 16;
-        self.to
-            .par_chunks_mut(chunk)
-            .zip(self.from.par_chunks(chunk))
-            .for_each(|(to, from)| to.copy_from_slice(from));
-    }
-
-    /// Bytes that [`Self::copy`] reads and writes.
-    fn copied(&self) -> f64 {
-        8.0 * self.from.len() as f64
     }
 }
 

@@ -1,15 +1,15 @@
 //! Every operation of `ops`, kernels against Burn's own on `flex`: outputs and every gradient.
 
-use burn::module::{Param, RunningState};
-use burn::nn::conv::{Conv2d, ConvTranspose2d};
-use burn::nn::{BatchNorm, PaddingConfig2d};
-use burn::tensor::{Device, Tensor, TensorData};
+mod draw;
+
+use burn::module::Param;
+use burn::nn::BatchNorm;
+use burn::tensor::{Device, Tensor};
 use demc_model::Ops;
 use demc_model::metrics;
 use demc_model::ops::adam::{Moments, Rule, sum_of_squares};
 use demc_model::ops::{Activation, Maps};
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use draw::{Draw, device, host};
 
 /// Sums of some hundred float32 products in two orders.
 const OF_LARGEST: f32 = 1e-5;
@@ -22,74 +22,6 @@ const ACTIVATIONS: [Activation; 2] = [Activation::None, Activation::Relu];
 
 /// What a run of one operation found: a name and the values of each tensor.
 type Found = Vec<(String, Vec<f32>)>;
-
-/// Values of order 1, the same for the same seed.
-struct Draw(ChaCha8Rng);
-
-impl Draw {
-    fn new() -> Self {
-        Draw(ChaCha8Rng::seed_from_u64(7))
-    }
-
-    fn tensor<const D: usize>(&mut self, shape: [usize; D], device: &Device) -> Tensor<D> {
-        let len = shape.iter().product();
-        let values: Vec<f32> = (0..len)
-            .map(|_| self.0.random_range(-1.0..1.0f32))
-            .collect();
-        Tensor::from_data(TensorData::new(values, shape), device)
-    }
-
-    fn param<const D: usize>(&mut self, shape: [usize; D]) -> Param<Tensor<D>> {
-        Param::from_tensor(self.tensor(shape, &device()))
-    }
-
-    fn conv(&mut self, [input, output]: [usize; 2], kernel: usize) -> Conv2d {
-        let pad = kernel / 2;
-        Conv2d {
-            weight: self.param([output, input, kernel, kernel]),
-            bias: Some(self.param([output])),
-            stride: [1, 1],
-            kernel_size: [kernel, kernel],
-            dilation: [1, 1],
-            groups: 1,
-            padding: PaddingConfig2d::Explicit(pad, pad, pad, pad),
-        }
-    }
-
-    fn deconv(&mut self, [input, output]: [usize; 2]) -> ConvTranspose2d {
-        ConvTranspose2d {
-            weight: self.param([input, output, 4, 4]),
-            bias: Some(self.param([output])),
-            stride: [2, 2],
-            kernel_size: [4, 4],
-            dilation: [1, 1],
-            groups: 1,
-            padding: [1, 1],
-            padding_out: [0, 0],
-            channels: [input, output],
-        }
-    }
-
-    fn norm(&mut self, channels: usize) -> BatchNorm {
-        BatchNorm {
-            gamma: self.param([channels]),
-            beta: self.param([channels]),
-            training: Param::from_bool(true),
-            running_mean: RunningState::new(self.tensor([channels], &device())),
-            running_var: RunningState::new(self.tensor([channels], &device()).square()),
-            momentum: 0.01,
-            epsilon: 1e-3,
-        }
-    }
-}
-
-fn device() -> Device {
-    Device::flex().autodiff()
-}
-
-fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().try_to_vec().expect("float32")
-}
 
 /// Runs `op` on inputs of `shapes` and sums its output with random weights. Returns output and gradients of the inputs,
 /// and the gradients for the parameters' own.

@@ -3,6 +3,8 @@
 //! A step keeps tensors, not copies: `flex` shares memory by reference count, and what one operation keeps as its output is
 //! what the next one keeps as its input. A gradient that nobody asks for (by the network's inputs) is not computed.
 
+mod convolution;
+
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, NodeGuard, Ops, OpsKind};
@@ -10,11 +12,12 @@ use burn::backend::flex::FlexTensor;
 use burn::backend::ops::FloatTensorOps;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, AutodiffBackend, Flex};
-use demc_kernels::{Grid, Isa, batch_norm, conv1x1, conv3x3, deconv4x4, pool};
+use demc_kernels::{Isa, batch_norm, pool};
 
 use super::KernelOps;
 use super::forward::{fuse, rel_mse_into};
 use super::slices::{buffer, contiguous, dims, grid, maps, tensor, values};
+use convolution::{Conv3x3, ConvState, Deconv4x4, Fuse};
 
 /// A tensor of `flex` under autodiff.
 type Tracked = FloatTensor<Autodiff<Flex>>;
@@ -146,145 +149,6 @@ where
             prep.finish(state, output)
         }
         OpsKind::UnTracked(prep) => prep.finish(output),
-    }
-}
-
-/// What a convolution of `P` inputs keeps.
-#[derive(Clone, Debug)]
-struct ConvState<const P: usize> {
-    inputs: [FlexTensor; P],
-    weight: FlexTensor,
-    /// The output, where it was rectified.
-    y: Option<FlexTensor>,
-}
-
-/// What a convolution's kernel takes on the way back.
-struct ConvGradients<'a, const P: usize> {
-    grid: Grid,
-    inputs: [&'a [f32]; P],
-    weight: &'a [f32],
-    y: Option<&'a [f32]>,
-    dy: &'a [f32],
-    dinputs: [Option<&'a mut [f32]>; P],
-    dweight: &'a mut [f32],
-    dbias: &'a mut [f32],
-}
-
-/// The way back through a convolution: `kernel` fills buffers, which are registered where somebody asks for them.
-///
-/// The nodes are those of the inputs, the weight and the bias; the weight's axis `output_axis` is the output's channels.
-fn convolution_back<const P: usize, const N: usize>(
-    ops: Ops<ConvState<P>, N>,
-    grads: &mut Gradients,
-    output_axis: usize,
-    kernel: impl FnOnce(ConvGradients<P>),
-) {
-    let dy = contiguous(grads.consume::<Flex>(&ops.node));
-    let ConvState { inputs, weight, y } = ops.state;
-    let mut nodes = ops.parents.into_iter();
-    let input_nodes: [_; P] = std::array::from_fn(|_| nodes.next().flatten());
-    let [weight_node, bias_node] = std::array::from_fn(|_| nodes.next().flatten());
-
-    let (grid, _) = grid(&inputs[0]);
-    let shape = dims::<4>(&weight);
-    let mut dinputs: [_; P] = std::array::from_fn(|i| {
-        let asked = input_nodes[i].as_ref();
-        asked.map(|_| buffer(values(&inputs[i]).len()))
-    });
-    let mut dweight = buffer(values(&weight).len());
-    let mut dbias = buffer(shape[output_axis]);
-    kernel(ConvGradients {
-        grid,
-        inputs: inputs.each_ref().map(values),
-        weight: values(&weight),
-        y: y.as_ref().map(values),
-        dy: values(&dy),
-        dinputs: dinputs.each_mut().map(Option::as_deref_mut),
-        dweight: &mut dweight,
-        dbias: &mut dbias,
-    });
-    for (node, dinput) in input_nodes.into_iter().zip(dinputs) {
-        if let (Some(node), Some(dinput)) = (node, dinput) {
-            grads.register::<Flex>(node.id, maps(grid, dinput));
-        }
-    }
-    if let Some(node) = weight_node {
-        grads.register::<Flex>(node.id, tensor(dweight, shape));
-    }
-    if let Some(node) = bias_node {
-        grads.register::<Flex>(node.id, tensor(dbias, [shape[output_axis]]));
-    }
-}
-
-#[derive(Debug)]
-struct Conv3x3;
-
-impl Backward<Flex, 3> for Conv3x3 {
-    type State = ConvState<1>;
-
-    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
-        convolution_back(ops, grads, 0, |g| {
-            let ([x], [dx]) = (g.inputs, g.dinputs);
-            conv3x3::backward(
-                Isa::current(),
-                g.grid,
-                x,
-                g.weight,
-                g.y,
-                g.dy,
-                dx,
-                g.dweight,
-                g.dbias,
-            );
-        });
-    }
-}
-
-#[derive(Debug)]
-struct Deconv4x4;
-
-impl Backward<Flex, 3> for Deconv4x4 {
-    type State = ConvState<1>;
-
-    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
-        convolution_back(ops, grads, 1, |g| {
-            let ([x], [dx]) = (g.inputs, g.dinputs);
-            deconv4x4::backward(
-                Isa::current(),
-                g.grid,
-                x,
-                g.weight,
-                g.y,
-                g.dy,
-                dx,
-                g.dweight,
-                g.dbias,
-            );
-        });
-    }
-}
-
-/// A fusion of `P` parts, whose `N` nodes are the parts', the weight's and the bias's.
-#[derive(Debug)]
-struct Fuse<const P: usize>;
-
-impl<const P: usize, const N: usize> Backward<Flex, N> for Fuse<P> {
-    type State = ConvState<P>;
-
-    fn backward(self, ops: Ops<Self::State, N>, grads: &mut Gradients, _: &mut Checkpointer) {
-        convolution_back(ops, grads, 0, |mut g| {
-            conv1x1::backward(
-                Isa::current(),
-                g.grid,
-                &g.inputs,
-                g.weight,
-                g.y,
-                g.dy,
-                &mut g.dinputs,
-                g.dweight,
-                g.dbias,
-            );
-        });
     }
 }
 

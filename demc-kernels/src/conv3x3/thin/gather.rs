@@ -1,0 +1,153 @@
+//! Neighbourhoods of pixels as rows (*im2col*).
+
+use std::ops::Range;
+
+use crate::conv3x3::parts::Source;
+use crate::rows::{Copy, copy};
+use crate::simd::{Leaf, Simd, run};
+use crate::{Grid, Isa};
+
+/// The neighbour of a pixel at a tap, if it lies in the image.
+#[inline(always)]
+pub(super) fn neighbour(grid: Grid, row: usize, column: usize, tap: usize) -> Option<isize> {
+    let (y, x) = (row + tap / 3, column + tap % 3);
+    let there = y >= 1 && y <= grid.height && x >= 1 && x <= grid.width;
+    there.then(|| {
+        (tap / 3) as isize * grid.width as isize + (tap % 3) as isize - grid.width as isize - 1
+    })
+}
+
+/// Row and column of a pixel in its image.
+#[inline(always)]
+fn place(grid: Grid, pixel: usize) -> (usize, usize) {
+    (pixel / grid.width % grid.height, pixel % grid.width)
+}
+
+/// The neighbourhoods of some pixels as rows of `9 * channels` values, `step` values apart.
+struct Gather<'a> {
+    source: Source<'a>,
+    grid: Grid,
+    pixels: Range<usize>,
+    /// Whether a row holds the pixels that this one gives to, instead of those that it takes from.
+    mirrored: bool,
+    rows: &'a mut [f32],
+    step: usize,
+}
+
+impl Leaf for Gather<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        let Gather {
+            source,
+            grid,
+            pixels,
+            mirrored,
+            rows,
+            step,
+        } = self;
+        let channels = source.channels;
+        assert!(
+            rows.len() >= pixels.len() * step && step >= 9 * channels,
+            "room for the neighbourhoods"
+        );
+        assert!(
+            pixels.end * channels <= source.map.len(),
+            "pixels of the map"
+        );
+        for (pixel, row) in pixels.zip(rows.chunks_exact_mut(step)) {
+            let (y, x) = place(grid, pixel);
+            let inside = y > 0 && y + 1 < grid.height && x > 0 && x + 1 < grid.width;
+            if inside && !mirrored {
+                // Three pixels side by side are three taps side by side.
+                for line in 0..3 {
+                    let first = (pixel + line * grid.width - grid.width - 1) * channels;
+                    // SAFETY: the pixel's eight neighbours lie in the image.
+                    unsafe {
+                        copy_part::<S>(source, first, &mut row[line * 3 * channels..], 3 * channels)
+                    };
+                }
+                continue;
+            }
+            for tap in 0..9 {
+                let to = &mut row[tap * channels..(tap + 1) * channels];
+                match neighbour(grid, y, x, if mirrored { 8 - tap } else { tap }) {
+                    None => to.fill(0.0),
+                    Some(offset) => {
+                        let first = pixel.wrapping_add_signed(offset) * channels;
+                        // SAFETY: the neighbour lies in the image.
+                        unsafe { copy_part::<S>(source, first, to, channels) };
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Copies `count` values from value `first`, gated.
+///
+/// # Safety
+/// The machine has the path of `S`, and the map and its gate that many values there.
+#[inline(always)]
+unsafe fn copy_part<S: Simd>(source: Source, first: usize, to: &mut [f32], count: usize) {
+    assert!(to.len() >= count);
+    for at in (0..count).step_by(S::LANES) {
+        let n = S::LANES.min(count - at);
+        // SAFETY: `n` values from `at` on are there.
+        unsafe {
+            let mut v = S::load_part(source.map.as_ptr().add(first + at), n);
+            if let Some(gate) = source.gate {
+                v = S::gate(v, S::load_part(gate.as_ptr().add(first + at), n));
+            }
+            S::store_part(to.as_mut_ptr().add(at), n, v);
+        }
+    }
+}
+
+impl Source<'_> {
+    /// See [`Gather`].
+    pub(super) fn gather(
+        &self,
+        isa: Isa,
+        grid: Grid,
+        pixels: Range<usize>,
+        mirrored: bool,
+        rows: &mut [f32],
+        step: usize,
+    ) {
+        assert!(
+            self.gate.is_none_or(|gate| gate.len() == self.map.len()),
+            "a gate of the map's size"
+        );
+        let leaf = Gather {
+            source: *self,
+            grid,
+            pixels,
+            mirrored,
+            rows,
+            step,
+        };
+        // SAFETY: the leaf checks its lengths, the gate's was checked.
+        unsafe { run(isa, leaf) }
+    }
+
+    /// Some pixels themselves as rows, `step` values apart.
+    pub(super) fn copy(&self, isa: Isa, pixels: Range<usize>, rows: &mut [f32], step: usize) {
+        let (first, channels) = (pixels.start * self.channels, self.channels);
+        copy(
+            isa,
+            Copy {
+                from: &self.map[first..],
+                from_step: channels,
+                gate: self.gate.map(|gate| &gate[first..]),
+                bias: None,
+                relu: false,
+                to: rows,
+                to_step: step,
+                rows: pixels.len(),
+                channels,
+            },
+        );
+    }
+}

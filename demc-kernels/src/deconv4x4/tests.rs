@@ -1,0 +1,87 @@
+//! Against plain float64 loops, whole and in bands.
+
+use super::*;
+use crate::reference;
+use crate::testing::{assert_close, f64s, few, grids, pattern};
+
+#[test]
+fn bands_of_rows_are_the_whole() {
+    let grid = Grid {
+        batch: 1,
+        height: 11,
+        width: 9,
+    };
+    let (inputs, outputs) = (18, 7);
+    for isa in Isa::available() {
+        let (x, weight) = (
+            pattern(grid.pixels() * inputs, 1),
+            pattern(outputs * inputs * 16, 2),
+        );
+        let bias = pattern(outputs, 3);
+        let mut whole = vec![f32::NAN; grid.doubled().pixels() * outputs];
+        forward(isa, grid, &x, &weight, &bias, true, &mut whole);
+        let ready = Ready::new(isa, &weight, &bias, true);
+        let mut bands = vec![f32::NAN; whole.len()];
+        for (first, end) in [(0, 1), (1, 7), (7, 11)] {
+            let (from, to) = (usize::saturating_sub(first, 1), (end + 1).min(grid.height));
+            let (row, y_row) = (grid.width * inputs, 4 * grid.width * outputs);
+            let band = Grid {
+                height: to - from,
+                ..grid
+            };
+            ready.forward(
+                band,
+                &x[from * row..to * row],
+                first - from,
+                &mut bands[first * y_row..end * y_row],
+            );
+        }
+        assert!(bands == whole, "{isa}");
+    }
+}
+
+#[test]
+fn equals_the_reference_on_every_path_at_odd_sizes() {
+    for isa in Isa::available() {
+        for grid in grids() {
+            for (inputs, outputs) in few(vec![(1, 1), (6, 5), (17, 8), (33, 20)], 2) {
+                for relu in [false, true] {
+                    let x = pattern(grid.pixels() * inputs, 1);
+                    let (weight, bias) = (pattern(inputs * outputs * 16, 2), pattern(outputs, 3));
+                    let dy = pattern(grid.doubled().pixels() * outputs, 4);
+                    let name = format!("{isa} {grid:?} {inputs} to {outputs}");
+                    let mut y = vec![f32::NAN; dy.len()];
+                    forward(isa, grid, &x, &weight, &bias, relu, &mut y);
+                    let expected =
+                        reference::deconv4x4(grid, &f64s(&x), &f64s(&weight), &f64s(&bias), relu);
+                    assert_close(&format!("{name} y"), &y, &expected);
+
+                    let gate = relu.then_some(&y[..]);
+                    let gated = match gate {
+                        Some(y) => reference::gated(&f64s(&dy), &f64s(y)),
+                        None => f64s(&dy),
+                    };
+                    let expected =
+                        reference::deconv4x4_backward(grid, &f64s(&x), &f64s(&weight), &gated);
+                    let mut dx = vec![f32::NAN; x.len()];
+                    let mut dweight = vec![f32::NAN; weight.len()];
+                    let mut dbias = vec![f32::NAN; outputs];
+                    backward(
+                        isa,
+                        grid,
+                        &x,
+                        &weight,
+                        gate,
+                        &dy,
+                        Some(&mut dx),
+                        &mut dweight,
+                        &mut dbias,
+                    );
+                    assert_close(&format!("{name} dx"), &dx, &expected.dx);
+                    assert_close(&format!("{name} dweight"), &dweight, &expected.dweight);
+                    assert_close(&format!("{name} dbias"), &dbias, &expected.dbias);
+                }
+            }
+        }
+    }
+}

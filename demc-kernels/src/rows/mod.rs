@@ -1,0 +1,218 @@
+//! Products over pixels as they lie in memory: what the 1x1 convolution and the deconvolution are made of.
+//!
+//! A *run* is a stretch of pixels, each a row of channels. Forward, rows of pixels times a packed weight; backward, the
+//! transposed weight the same way, and for the weight's gradient a reduction over pixels. A convolution with several
+//! taps or several inputs is a sum of such products, each from another place.
+
+mod copy;
+mod outer;
+
+use rayon::prelude::*;
+
+use crate::Isa;
+use crate::product::{Left, Panels, Right, padded_rows, product};
+use crate::scratch::{Scratch, Shared};
+use crate::simd::{Leaf, Simd, run};
+
+pub(crate) use copy::{Copy, column_sums, copy};
+pub(crate) use outer::{Outer, Window, add_outer, outer};
+
+/// Most rows of a product that are made at once.
+pub(crate) const BLOCK: usize = 96;
+
+/// Columns rounded up to what every path's vectors fill.
+pub(crate) fn whole(columns: usize) -> usize {
+    columns.next_multiple_of(16)
+}
+
+/// A weight `[depth, columns]`, packed for the products of one path.
+pub(crate) struct Packed {
+    depth: usize,
+    columns: usize,
+    values: Scratch,
+}
+
+struct Pack<'a, F> {
+    rows: std::ops::Range<usize>,
+    depth: usize,
+    columns: usize,
+    value: &'a F,
+    to: Shared,
+}
+
+impl<F: Fn(usize, usize) -> f32> Leaf for Pack<'_, F> {
+    type Out = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        let panels = Panels::new::<S>(self.columns);
+        for k in self.rows {
+            for first in (0..panels.padded).step_by(S::LANES) {
+                let place = panels.place(self.depth, k, first);
+                for lane in 0..S::LANES {
+                    let column = first + lane;
+                    let value = if column < self.columns {
+                        (self.value)(k, column)
+                    } else {
+                        0.0
+                    };
+                    // SAFETY: row `k` is this leaf's, and its vectors lie within the operand.
+                    unsafe { *self.to.pointer().add(place + lane) = value };
+                }
+            }
+        }
+    }
+}
+
+impl Packed {
+    /// The weight whose entry in row `k` and a column is `value(k, column)`.
+    pub(crate) fn new(
+        isa: Isa,
+        depth: usize,
+        columns: usize,
+        value: impl Fn(usize, usize) -> f32 + Sync,
+    ) -> Self {
+        let mut values = Scratch::take(depth * whole(columns));
+        let to = Shared::new(&mut values);
+        let step = (8192 / columns).max(1);
+        (0..depth.div_ceil(step)).into_par_iter().for_each(|task| {
+            let rows = task * step..((task + 1) * step).min(depth);
+            // SAFETY: tasks write different rows.
+            unsafe {
+                run(
+                    isa,
+                    Pack {
+                        rows,
+                        depth,
+                        columns,
+                        value: &value,
+                        to,
+                    },
+                )
+            };
+        });
+        Packed {
+            depth,
+            columns,
+            values,
+        }
+    }
+
+    /// A weight `[depth, columns]` whose packed values the caller writes.
+    pub(crate) fn empty(depth: usize, columns: usize) -> Self {
+        Packed {
+            depth,
+            columns,
+            values: Scratch::take(depth * whole(columns)),
+        }
+    }
+
+    /// Its columns.
+    pub(crate) fn columns(&self) -> usize {
+        self.columns
+    }
+
+    /// The packed values; see [`Panels::place`].
+    pub(crate) fn values(&mut self) -> Shared {
+        Shared::new(&mut self.values)
+    }
+}
+
+/// Rows of a block, at most [`BLOCK`], of which there are enough for all threads.
+pub(crate) fn block_rows(rows: usize) -> usize {
+    let blocks = rows
+        .div_ceil(BLOCK)
+        .next_multiple_of(rayon::current_num_threads());
+    rows.div_ceil(blocks)
+}
+
+/// One term of a sum of products: rows from `start`, `step` values apart, times a weight.
+#[derive(Clone, Copy)]
+pub(crate) struct Term<'a> {
+    pub(crate) rows: &'a [f32],
+    pub(crate) step: usize,
+    pub(crate) weight: &'a Packed,
+}
+
+struct Sum<'a> {
+    count: usize,
+    terms: &'a [Term<'a>],
+    add: bool,
+    c: &'a mut [f32],
+    c_step: usize,
+}
+
+impl Leaf for Sum<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        let rows = padded_rows(self.count);
+        assert!(self.c.len() >= rows * self.c_step, "room for {rows} rows");
+        for (index, term) in self.terms.iter().enumerate() {
+            let Packed {
+                depth,
+                columns,
+                values,
+            } = term.weight;
+            assert!(*columns <= self.c_step && term.rows.len() >= (rows - 1) * term.step + depth);
+            // SAFETY: just checked; the weight was packed for this depth and these columns.
+            unsafe {
+                let a = Left {
+                    start: term.rows.as_ptr(),
+                    row_step: term.step,
+                    k_step: 1,
+                };
+                let b = Right::Packed(values.as_ptr());
+                let c = self.c.as_mut_ptr();
+                product::<S>(
+                    self.count,
+                    *depth,
+                    *columns,
+                    a,
+                    b,
+                    c,
+                    self.c_step,
+                    self.add || index > 0,
+                );
+            }
+        }
+    }
+}
+
+/// The sum of the terms, `count` rows into `c`, whose rows are `c_step` values apart.
+///
+/// # Panics
+/// Where a slice is shorter than [`padded_rows`] of `count` need.
+pub(crate) fn sum(isa: Isa, count: usize, terms: &[Term], c: &mut [f32], c_step: usize) {
+    // SAFETY: the leaf checks its lengths.
+    unsafe {
+        run(
+            isa,
+            Sum {
+                count,
+                terms,
+                add: false,
+                c,
+                c_step,
+            },
+        )
+    }
+}
+
+/// The same, added to what `c` holds.
+pub(crate) fn add_sum(isa: Isa, count: usize, terms: &[Term], c: &mut [f32], c_step: usize) {
+    // SAFETY: the leaf checks its lengths.
+    unsafe {
+        run(
+            isa,
+            Sum {
+                count,
+                terms,
+                add: true,
+                c,
+                c_step,
+            },
+        )
+    }
+}
