@@ -13,6 +13,12 @@ use rayon::prelude::*;
 /// Rows of the largest tile of a convolution.
 pub(super) const TILE_ROWS: usize = 4;
 
+/// The bands of `height` rows, `band` each but the last.
+pub(super) fn bands(height: usize, band: usize) -> impl Iterator<Item = Range<usize>> {
+    let starts = (0..height).step_by(band);
+    starts.map(move |start| start..(start + band).min(height))
+}
+
 /// The rows of one image's map that are there. Memory is held for those alone, so that what waits for its next band is
 /// small.
 pub(super) struct Stream {

@@ -4,41 +4,16 @@
 use std::ops::Range;
 
 use demc_kernels::conv1x1::{self, Finish};
-use demc_kernels::{Grid, Isa, deconv4x4, grid, memory};
+use demc_kernels::{Grid, Isa, deconv4x4, memory};
 
-use super::encoder::{Encoded, bands};
+use super::band::bands;
 use super::layer::Layer;
 use super::{Maps, Run};
 use crate::decoder::DecoderLevel;
 
 impl Run<'_> {
-    /// Planar images `[B, 3, H, W]` from what the encoders left.
-    pub(super) fn decode(&self, encoded: Encoded) -> Vec<f32> {
-        let Encoded {
-            sums,
-            again,
-            bottom,
-        } = encoded;
-        let latent = &self.model.latent;
-        let mut x = self.conv3x3(&bottom, &Layer::conv(&latent.conv, latent.norm.as_ref()));
-        drop(bottom);
-        let decoder = &self.model.decoder;
-        for (level, sum) in decoder.levels.iter().zip(sums.into_iter().rev()) {
-            x = self.ascend(level, &x, sum);
-        }
-        match again {
-            Some(again) => self.finish_in_step(&x, again),
-            None => {
-                let image = self.conv3x3(&x, &Layer::conv(&decoder.head, None));
-                let mut planar = memory::buffer(image.values.len());
-                grid::nchw_from_nhwc(image.grid, &image.values, &mut planar);
-                planar
-            }
-        }
-    }
-
     /// A level: `sum` is the skips' share of its fusion and becomes its output.
-    fn ascend(&self, level: &DecoderLevel, below: &Maps, mut sum: Maps) -> Maps {
+    pub(super) fn ascend(&self, level: &DecoderLevel, below: &Maps, mut sum: Maps) -> Maps {
         let layers = level_layers(level);
         let ascent = self.ascent(level, &layers);
         let grid = sum.grid;

@@ -6,10 +6,9 @@ use demc_kernels::conv1x1::{self, Finish};
 use demc_kernels::conv3x3::Ready;
 use demc_kernels::{Grid, pool};
 
-use super::band::{Chain, Stage, Stream};
+use super::band::{Chain, Stage, Stream, bands};
 use super::images::Images;
 use super::layer::Layer;
-use super::step::{Again, LEVELS_IN_STEP};
 use super::{Maps, Run};
 use crate::config::{Input, LEVELS};
 use crate::encoder::EncoderLevel;
@@ -19,47 +18,9 @@ use crate::layers::ConvBlock;
 /// Deepest level that is computed in bands; below it, a map is smaller than the ready weights of its convolutions.
 pub(super) const DEEPEST_BANDED: usize = 2;
 
-/// What the encoders leave for the decoder.
-pub(super) struct Encoded {
-    /// The skips' share of each level's fusion, from the full resolution down; without the first where it is `again`.
-    pub(super) sums: Vec<Maps>,
-    /// What the first level's skips can be computed from once more.
-    pub(super) again: Option<Again>,
-    /// The latent's input.
-    pub(super) bottom: Maps,
-}
-
 impl Run<'_> {
-    /// All encoders, all levels.
-    pub(super) fn encode(&self, images: Images) -> Encoded {
-        let (mut sums, mut again) = (Vec::with_capacity(LEVELS), None);
-        let (first, mut inputs) = match self.plan.is_banded(images.grid) {
-            true => {
-                let step = self.descend_in_step(images);
-                sums.push(step.sum);
-                again = Some(step.again);
-                (LEVELS_IN_STEP, step.below)
-            }
-            false => (0, self.inputs(images)),
-        };
-        for level in first..LEVELS {
-            let grid = inputs[0].grid;
-            let banded = level <= DEEPEST_BANDED && self.plan.is_banded(grid);
-            sums.push(match banded {
-                true => self.descend_in_bands(level, &mut inputs),
-                false => self.descend(level, &mut inputs),
-            });
-        }
-        let bottom = inputs.pop().expect("the last encoder feeds the latent");
-        Encoded {
-            sums,
-            again,
-            bottom,
-        }
-    }
-
     /// What the encoders eat, at once.
-    fn inputs(&self, images: Images) -> Vec<Maps> {
+    pub(super) fn inputs(&self, images: Images) -> Vec<Maps> {
         let spec = self.model.config().variant.spec();
         let detail = spec.has_fusion().then(|| {
             let features = images.interleaved(&[Input::Features], None);
@@ -79,7 +40,7 @@ impl Run<'_> {
 
     /// Takes all encoders down a level, whole maps at a time: their inputs become those of the level below. Returns the
     /// skips' share of the level's fusion.
-    fn descend(&self, level: usize, inputs: &mut Vec<Maps>) -> Maps {
+    pub(super) fn descend(&self, level: usize, inputs: &mut Vec<Maps>) -> Maps {
         let grid = inputs[0].grid;
         let fuse = self.fuse(level);
         let mut sum = Maps::new(grid, fuse.outputs());
@@ -119,7 +80,7 @@ impl Run<'_> {
     }
 
     /// The same in bands, encoder by encoder.
-    fn descend_in_bands(&self, level: usize, inputs: &mut Vec<Maps>) -> Maps {
+    pub(super) fn descend_in_bands(&self, level: usize, inputs: &mut Vec<Maps>) -> Maps {
         let grid = inputs[0].grid;
         let fuse = self.fuse(level);
         let mut sum = Maps::new(grid, fuse.outputs());
@@ -250,10 +211,4 @@ pub(super) struct Level<'a> {
 
 pub(super) fn block_layer(block: &ConvBlock) -> Layer {
     Layer::conv(&block.conv, block.norm.as_ref())
-}
-
-/// The bands of `height` rows, `band` each but the last.
-pub(super) fn bands(height: usize, band: usize) -> impl Iterator<Item = Range<usize>> {
-    let starts = (0..height).step_by(band);
-    starts.map(move |start| start..(start + band).min(height))
 }

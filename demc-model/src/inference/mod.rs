@@ -27,14 +27,16 @@ use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use burn::tensor::{Tensor, TensorData};
 use demc_kernels::conv3x3::{self, Tile};
-use demc_kernels::{Grid, Isa, memory};
+use demc_kernels::{Grid, Isa, grid, memory};
 
-use crate::config::COLOR_CHANNELS;
+use crate::config::{COLOR_CHANNELS, LEVELS};
 use crate::denoiser::Denoiser;
 use crate::ops::Ops;
 use band::TILE_ROWS;
+use encoder::DEEPEST_BANDED;
 use images::Images;
 use layer::Layer;
+use step::{Again, LEVELS_IN_STEP};
 
 pub use estimate::{peak_bytes, reusable_bytes};
 
@@ -118,7 +120,70 @@ struct Run<'a> {
     model: &'a Denoiser,
 }
 
+/// What the encoders leave for the decoder.
+struct Encoded {
+    /// The skips' share of each level's fusion, from the full resolution down; without the first where it is `again`.
+    sums: Vec<Maps>,
+    /// What the first level's skips can be computed from once more.
+    again: Option<Again>,
+    /// The latent's input.
+    bottom: Maps,
+}
+
 impl Run<'_> {
+    /// All encoders, all levels.
+    fn encode(&self, images: Images) -> Encoded {
+        let (mut sums, mut again) = (Vec::with_capacity(LEVELS), None);
+        let (first, mut inputs) = match self.plan.is_banded(images.grid) {
+            true => {
+                let step = self.descend_in_step(images);
+                sums.push(step.sum);
+                again = Some(step.again);
+                (LEVELS_IN_STEP, step.below)
+            }
+            false => (0, self.inputs(images)),
+        };
+        for level in first..LEVELS {
+            let grid = inputs[0].grid;
+            let banded = level <= DEEPEST_BANDED && self.plan.is_banded(grid);
+            sums.push(match banded {
+                true => self.descend_in_bands(level, &mut inputs),
+                false => self.descend(level, &mut inputs),
+            });
+        }
+        let bottom = inputs.pop().expect("the last encoder feeds the latent");
+        Encoded {
+            sums,
+            again,
+            bottom,
+        }
+    }
+
+    /// Planar images `[B, 3, H, W]` from what the encoders left.
+    fn decode(&self, encoded: Encoded) -> Vec<f32> {
+        let Encoded {
+            sums,
+            again,
+            bottom,
+        } = encoded;
+        let latent = &self.model.latent;
+        let mut x = self.conv3x3(&bottom, &Layer::conv(&latent.conv, latent.norm.as_ref()));
+        drop(bottom);
+        let decoder = &self.model.decoder;
+        for (level, sum) in decoder.levels.iter().zip(sums.into_iter().rev()) {
+            x = self.ascend(level, &x, sum);
+        }
+        match again {
+            Some(again) => self.finish_in_step(&x, again),
+            None => {
+                let image = self.conv3x3(&x, &Layer::conv(&decoder.head, None));
+                let mut planar = memory::buffer(image.values.len());
+                grid::nchw_from_nhwc(image.grid, &image.values, &mut planar);
+                planar
+            }
+        }
+    }
+
     /// A convolution with its ReLU, of whole maps.
     fn conv3x3(&self, x: &Maps, layer: &Layer) -> Maps {
         let mut y = Maps::new(x.grid, layer.outputs());

@@ -9,9 +9,9 @@ use std::ops::Range;
 
 use demc_kernels::{Grid, memory};
 
-use super::band::Chain;
+use super::band::{Chain, bands};
 use super::decoder::level_layers;
-use super::encoder::{Level, bands, block_layer};
+use super::encoder::{Level, block_layer};
 use super::images::Images;
 use super::layer::Layer;
 use super::{Maps, Run};
