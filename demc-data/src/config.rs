@@ -28,6 +28,8 @@ const CACHE_MIB: usize = 4096;
 /// Ours: one thread keeps ahead of training on a CPU.
 const WORKERS: usize = 1;
 
+/// Below 1, `y^gamma` has an infinite slope at black, and so has the loss; more than 6 is a mistake.
+const GAMMAS: std::ops::RangeInclusive<f32> = 1.0..=6.0;
 /// The network halves its input five times: patches are multiples of this (Fig. 3).
 const PATCH_MULTIPLE: usize = 32;
 /// A longer side is a mistake: the paper's scenes are 1280x720.
@@ -53,7 +55,7 @@ pub struct DataConfig {
     pub stride: usize,
     /// `"shift"`: a last row and column of patches at the edge; `"drop"`: none.
     pub border: Border,
-    /// The transfer function's exponent is `1 / gamma` (Eq. 4).
+    /// The transfer function's exponent is `1 / gamma` (Eq. 4); from 1 to 6.
     pub gamma: f32,
     /// Patches in a batch, at most 65536.
     pub batch_size: usize,
@@ -104,10 +106,10 @@ impl DataConfig {
         );
         require(self.stride > 0, "stride", &self.stride, "at least 1");
         require(
-            self.gamma.is_finite() && self.gamma > 0.0,
+            GAMMAS.contains(&self.gamma),
             "gamma",
             &self.gamma,
-            "a positive number",
+            "from 1 to 6",
         );
         require(
             (1..=MAX_BATCH_SIZE).contains(&self.batch_size),
@@ -182,11 +184,12 @@ mod tests {
             patch_size: MAX_PATCH_SIZE + 32 * more,
             batch_size: MAX_BATCH_SIZE + more,
             cache_mib: MAX_CACHE_MIB + more,
+            gamma: 6.0 + more as f32,
             ..DataConfig::default()
         };
         assert_eq!(sized(0).validate(), Vec::<String>::new());
         let problems = sized(1).validate();
-        assert_eq!(problems.len(), 3, "{problems:?}");
+        assert_eq!(problems.len(), 4, "{problems:?}");
     }
 
     #[test]

@@ -195,6 +195,9 @@ pub fn backward(
         "an output of {} values",
         dy.len()
     );
+    if let Some(dx) = &dx {
+        assert_eq!(dx.len(), x.len(), "an input's gradient");
+    }
     let nothing = Finish {
         bias: None,
         relu: false,
