@@ -1,14 +1,30 @@
-//! Flips and transposes of training patches, drawn for each patch of each epoch; off in the paper's preset
-//! (Sec. 4.2 names none). Normals and positions are world-space values of a pixel: they move with it and
-//! keep their numbers.
+//! What is changed about a training patch so that it counts as another one, drawn for each patch of each epoch; off in
+//! the paper's preset (Sec. 4.2 names none).
+//!
+//! Flips and transposes move pixels: normals and positions are world-space values of a pixel, so they move with it and
+//! keep their numbers. A permutation of red, green and blue is the same for colour, textures and reference, an
+//! exposure the same for colour and reference: light transport is linear in both.
 
-use rand::Rng;
+use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
 
 use crate::seed::{Use, generator};
 
-/// Which augmentations are drawn. In a configuration: `true` (all), `false`, or a list of `"flip"` and
-/// `"transpose"`.
+/// An exposure is drawn between minus and plus so many stops (factors of 2); ours.
+const EXPOSURE_STOPS: f32 = 1.0;
+
+/// The orders of red, green and blue.
+const RGB_ORDERS: [[usize; 3]; 6] = [
+    [0, 1, 2],
+    [0, 2, 1],
+    [1, 0, 2],
+    [1, 2, 0],
+    [2, 0, 1],
+    [2, 1, 0],
+];
+
+/// Which augmentations are drawn. In a configuration: `true` (all), `false`, or a list of `"flip"`, `"transpose"`, `"rgb"`
+/// and `"exposure"`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "Setting", into = "Setting")]
 pub struct Augment {
@@ -16,77 +32,110 @@ pub struct Augment {
     pub flip: bool,
     /// Swap rows and columns half of the time.
     pub transpose: bool,
+    /// Permute red, green and blue of colour, textures and reference, each order equally often.
+    pub rgb: bool,
+    /// Multiply colour and reference by `2^u`, u uniform from -1 to 1.
+    pub exposure: bool,
 }
 
 #[derive(Serialize, Deserialize)]
 #[serde(
     untagged,
-    expecting = "augment must be true, false or a list of \"flip\" and \"transpose\""
+    expecting = "augment must be true, false or a list of \"flip\", \"transpose\", \"rgb\" and \"exposure\""
 )]
 enum Setting {
     All(bool),
     Some(Vec<Kind>),
 }
 
-#[derive(Serialize, Deserialize)]
+#[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 enum Kind {
     Flip,
     Transpose,
+    Rgb,
+    Exposure,
+}
+
+const KINDS: [Kind; 4] = [Kind::Flip, Kind::Transpose, Kind::Rgb, Kind::Exposure];
+
+impl Augment {
+    fn has(self, kind: Kind) -> bool {
+        match kind {
+            Kind::Flip => self.flip,
+            Kind::Transpose => self.transpose,
+            Kind::Rgb => self.rgb,
+            Kind::Exposure => self.exposure,
+        }
+    }
+
+    fn of(kinds: &[Kind]) -> Self {
+        Self {
+            flip: kinds.contains(&Kind::Flip),
+            transpose: kinds.contains(&Kind::Transpose),
+            rgb: kinds.contains(&Kind::Rgb),
+            exposure: kinds.contains(&Kind::Exposure),
+        }
+    }
 }
 
 impl From<Setting> for Augment {
     fn from(setting: Setting) -> Self {
         match setting {
-            Setting::All(all) => Self {
-                flip: all,
-                transpose: all,
-            },
-            Setting::Some(kinds) => Self {
-                flip: kinds.iter().any(|kind| matches!(kind, Kind::Flip)),
-                transpose: kinds.iter().any(|kind| matches!(kind, Kind::Transpose)),
-            },
+            Setting::All(true) => Self::of(&KINDS),
+            Setting::All(false) => Self::default(),
+            Setting::Some(kinds) => Self::of(&kinds),
         }
     }
 }
 
 impl From<Augment> for Setting {
     fn from(augment: Augment) -> Self {
-        match (augment.flip, augment.transpose) {
-            (false, false) => Setting::All(false),
-            (true, true) => Setting::All(true),
-            (true, false) => Setting::Some(vec![Kind::Flip]),
-            (false, true) => Setting::Some(vec![Kind::Transpose]),
+        let kinds = KINDS.into_iter().filter(|kind| augment.has(*kind));
+        match kinds.collect::<Vec<_>>() {
+            none if none.is_empty() => Setting::All(false),
+            all if all.len() == KINDS.len() => Setting::All(true),
+            some => Setting::Some(some),
         }
     }
 }
 
 /// What was drawn for one patch.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Orientation {
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Variation {
     flip_x: bool,
     flip_y: bool,
     transpose: bool,
+    /// Which channel of the image becomes red, green and blue.
+    pub rgb: [usize; 3],
+    /// Factor on colour and reference.
+    pub exposure: f32,
 }
 
 impl Augment {
-    /// The orientation of the patch at `position` of `epoch`.
-    pub fn draw(self, seed: u64, epoch: u64, position: u64) -> Orientation {
-        let bits = generator(Use::Augment, seed, epoch, position).next_u32();
-        Orientation {
+    /// What is changed about the patch at `position` of `epoch`.
+    pub fn draw(self, seed: u64, epoch: u64, position: u64) -> Variation {
+        let mut rng = generator(Use::Augment, seed, epoch, position);
+        // All are drawn, whatever is on: switching one off leaves the others as they were.
+        let bits = rng.next_u32();
+        let order = RGB_ORDERS[rng.random_range(0..RGB_ORDERS.len())];
+        let stops = rng.random_range(-EXPOSURE_STOPS..EXPOSURE_STOPS);
+        Variation {
             flip_x: self.flip && bits & 1 != 0,
             flip_y: self.flip && bits & 2 != 0,
             transpose: self.transpose && bits & 4 != 0,
+            rgb: if self.rgb { order } else { RGB_ORDERS[0] },
+            exposure: if self.exposure { stops.exp2() } else { 1.0 },
         }
     }
 }
 
-impl Orientation {
+impl Variation {
     /// Turns square planes in place.
     ///
     /// # Shapes
     /// `planes` is `[N, size, size]`.
-    pub fn apply(self, planes: &mut [f32], size: usize) {
+    pub fn turn(self, planes: &mut [f32], size: usize) {
         for plane in planes.chunks_exact_mut(size * size) {
             if self.flip_x {
                 plane.chunks_exact_mut(size).for_each(<[f32]>::reverse);
@@ -112,15 +161,23 @@ impl Orientation {
 mod tests {
     use super::*;
 
-    const NONE: Orientation = Orientation {
+    const NONE: Variation = Variation {
         flip_x: false,
         flip_y: false,
         transpose: false,
+        rgb: [0, 1, 2],
+        exposure: 1.0,
+    };
+    const TURNS: Augment = Augment {
+        flip: true,
+        transpose: true,
+        rgb: false,
+        exposure: false,
     };
 
-    fn turned(orientation: Orientation) -> Vec<f32> {
+    fn turned(orientation: Variation) -> Vec<f32> {
         let mut planes = vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0];
-        orientation.apply(&mut planes, 3);
+        orientation.turn(&mut planes, 3);
         planes
     }
 
@@ -128,21 +185,21 @@ mod tests {
     fn each_part_moves_pixels_as_its_name_says() {
         assert_eq!(turned(NONE), [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]);
         assert_eq!(
-            turned(Orientation {
+            turned(Variation {
                 flip_x: true,
                 ..NONE
             }),
             [3.0, 2.0, 1.0, 6.0, 5.0, 4.0, 9.0, 8.0, 7.0]
         );
         assert_eq!(
-            turned(Orientation {
+            turned(Variation {
                 flip_y: true,
                 ..NONE
             }),
             [7.0, 8.0, 9.0, 4.0, 5.0, 6.0, 1.0, 2.0, 3.0]
         );
         assert_eq!(
-            turned(Orientation {
+            turned(Variation {
                 transpose: true,
                 ..NONE
             }),
@@ -154,22 +211,43 @@ mod tests {
     fn off_never_turns_and_on_reaches_all_eight_orientations() {
         let drawn = |augment: Augment| (0..200).map(move |position| augment.draw(1, 2, position));
         assert!(drawn(Augment::default()).all(|orientation| orientation == NONE));
-        let mut images: Vec<Vec<f32>> = drawn(Augment {
-            flip: true,
-            transpose: true,
-        })
-        .map(turned)
-        .collect();
+        let mut images: Vec<Vec<f32>> = drawn(TURNS).map(turned).collect();
         images.sort_by(|a, b| a.partial_cmp(b).expect("finite"));
         images.dedup();
         assert_eq!(images.len(), 8);
         assert!(
             drawn(Augment {
                 flip: false,
-                transpose: true
+                ..TURNS
             })
-            .all(|o| !o.flip_x && !o.flip_y)
+            .all(|v| !v.flip_x && !v.flip_y && v.rgb == NONE.rgb && v.exposure == 1.0)
         );
+    }
+
+    #[test]
+    fn every_order_of_rgb_and_the_whole_range_of_exposures_are_drawn() {
+        let all = Augment::of(&KINDS);
+        let drawn: Vec<Variation> = (0..300).map(|position| all.draw(1, 2, position)).collect();
+        for order in RGB_ORDERS {
+            let count = drawn.iter().filter(|v| v.rgb == order).count();
+            // 50 expected, deviation 6.5.
+            assert!((20..80).contains(&count), "{order:?}: {count}");
+        }
+        let exposures = drawn.iter().map(|v| v.exposure);
+        let (least, most) = exposures.fold((f32::MAX, 0.0), |(a, b): (f32, f32), e| {
+            (a.min(e), b.max(e))
+        });
+        assert!((0.5..0.55).contains(&least) && (1.8..2.0).contains(&most));
+    }
+
+    /// What else is on does not change what one augmentation draws.
+    #[test]
+    fn augmentations_are_independent_of_each_other() {
+        let all = Augment::of(&KINDS);
+        for position in 0..50 {
+            let (both, turns) = (all.draw(7, 0, position), TURNS.draw(7, 0, position));
+            assert_eq!(turned(both), turned(turns));
+        }
     }
 
     #[test]
@@ -178,15 +256,21 @@ mod tests {
         struct Table {
             augment: Augment,
         }
-        for (text, flip, transpose) in [
-            ("augment = true", true, true),
-            ("augment = false", false, false),
-            ("augment = [\"flip\"]", true, false),
-            ("augment = [\"transpose\", \"flip\"]", true, true),
-            ("augment = []", false, false),
+        let only = |kinds: &[Kind]| Augment::of(kinds);
+        for (text, expected) in [
+            ("augment = true", only(&KINDS)),
+            ("augment = false", Augment::default()),
+            ("augment = [\"flip\"]", only(&[Kind::Flip])),
+            ("augment = [\"transpose\", \"flip\"]", TURNS),
+            ("augment = [\"rgb\"]", only(&[Kind::Rgb])),
+            (
+                "augment = [\"exposure\", \"rgb\"]",
+                only(&[Kind::Rgb, Kind::Exposure]),
+            ),
+            ("augment = []", Augment::default()),
         ] {
             let table: Table = toml::from_str(text).expect(text);
-            assert_eq!(table.augment, Augment { flip, transpose }, "{text}");
+            assert_eq!(table.augment, expected, "{text}");
             let written = toml::to_string(&table).expect("plain data");
             assert_eq!(toml::from_str::<Table>(&written).expect("its own"), table);
         }
@@ -194,7 +278,7 @@ mod tests {
         assert!(
             error
                 .message()
-                .contains("a list of \"flip\" and \"transpose\""),
+                .contains("a list of \"flip\", \"transpose\", \"rgb\" and \"exposure\""),
             "{error}"
         );
     }

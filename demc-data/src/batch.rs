@@ -2,9 +2,9 @@
 //! permutation of all patches; batch n is patches `n B .. (n + 1) B` of it. So a batch depends on the
 //! configuration, the seed and n only, and a resumed run goes on where it stopped.
 
-use crate::augment::{Augment, Orientation};
+use crate::augment::{Augment, Variation};
 use crate::cache::{CacheUse, SceneCache};
-use crate::frame::{FEATURES, FramePlanes};
+use crate::frame::{FEATURES, FramePlanes, TEXTURES};
 use crate::patch::{Patch, epoch_order, patches};
 use crate::plane::Plane;
 use crate::{ChannelLayout, DataConfig, Error, Normalizer, Scene};
@@ -20,7 +20,7 @@ pub struct Batch {
     pub features_z: Vec<f32>,
     /// Reference colour `[B, 3, P, P]`, linear HDR.
     pub reference_hdr: Vec<f32>,
-    /// Where each patch was cut, before any flip or transpose.
+    /// Where each patch was cut, before any augmentation.
     pub patches: Vec<Patch>,
 }
 
@@ -39,7 +39,7 @@ pub struct PatchSource {
 /// One place in the patch stream.
 struct Draw {
     patch: Patch,
-    orientation: Orientation,
+    variation: Variation,
 }
 
 /// One patch's share of a batch's buffers.
@@ -158,10 +158,10 @@ impl PatchSource {
                 .skip(position as usize)
                 .take(self.batch_size - draws.len())
             {
-                let orientation = self.augment.draw(self.seed, epoch, position);
+                let variation = self.augment.draw(self.seed, epoch, position);
                 draws.push(Draw {
                     patch: self.patches[index as usize],
-                    orientation,
+                    variation,
                 });
                 position += 1;
             }
@@ -170,26 +170,53 @@ impl PatchSource {
         draws
     }
 
-    /// Cuts one patch, turns it and takes it to the network's space.
+    /// Cuts one patch, varies it and takes it to the network's space.
     fn cut(&self, from: &FramePlanes, place: &mut Place<'_>) {
         let reference = from.reference.as_ref().expect("it is read as required");
-        for (planes, out) in [
-            (&from.color, &mut place.color),
-            (&from.features, &mut place.features),
-            (reference, &mut place.reference),
+        let (patch, size) = (place.draw.patch, self.patch_size);
+        let variation = place.draw.variation;
+        for (planes, out, order) in [
+            (&from.color[..], &mut *place.color, rgb_order(0, variation)),
+            (&from.features, place.features, feature_order(variation)),
+            (reference, place.reference, rgb_order(0, variation)),
         ] {
-            cut_planes(planes, from.width, place.draw.patch, self.patch_size, out);
-            place.draw.orientation.apply(out, self.patch_size);
+            let planes = order.iter().map(|plane| &planes[*plane]);
+            cut_planes(planes, from.width, patch, size, out);
+            variation.turn(out, size);
+        }
+        for radiance in [&mut place.color, &mut place.reference] {
+            radiance
+                .iter_mut()
+                .for_each(|value| *value *= variation.exposure);
         }
         self.normalizer.color_gamma_from_hdr(place.color);
         self.normalizer.features_z_from_raw(place.features);
     }
 }
 
+/// Which planes become red, green and blue, of three that begin at `first`.
+fn rgb_order(first: usize, variation: Variation) -> Vec<usize> {
+    variation.rgb.map(|channel| first + channel).to_vec()
+}
+
+/// Which planes become the features: normals and positions as they are, textures permuted.
+fn feature_order(variation: Variation) -> Vec<usize> {
+    let textures = [TEXTURES, TEXTURES + 3].map(|first| rgb_order(first, variation));
+    (0..TEXTURES)
+        .chain(textures.into_iter().flatten())
+        .collect()
+}
+
 /// Copies a patch of every plane to `out`, `[planes, size, size]`.
-fn cut_planes(planes: &[Plane], width: usize, patch: Patch, size: usize, out: &mut [f32]) {
+fn cut_planes<'a>(
+    planes: impl Iterator<Item = &'a Plane>,
+    width: usize,
+    patch: Patch,
+    size: usize,
+    out: &mut [f32],
+) {
     let origin = patch.y as usize * width + patch.x as usize;
-    for (plane, out) in planes.iter().zip(out.chunks_exact_mut(size * size)) {
+    for (plane, out) in planes.zip(out.chunks_exact_mut(size * size)) {
         for (row, out) in out.chunks_exact_mut(size).enumerate() {
             plane.copy_to(origin + row * width, out);
         }

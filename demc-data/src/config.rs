@@ -61,7 +61,7 @@ pub struct DataConfig {
     pub batch_size: usize,
     /// Share of the training split's base scenes that is held out for validation, 0 to below 1.
     pub validation: f64,
-    /// Flips and transposes: `true`, `false` or a list of `"flip"` and `"transpose"`.
+    /// Augmentation: `true` (all), `false` or a list of `"flip"`, `"transpose"`, `"rgb"` and `"exposure"`.
     pub augment: Augment,
     /// Memory for decoded scenes, in MiB, at most 2^24.
     pub cache_mib: usize,

@@ -42,7 +42,24 @@ fn fill_and_rename(
     #[cfg(unix)]
     file.set_permissions(std::os::unix::fs::PermissionsExt::from_mode(0o644))?;
     file.sync_all()?;
-    fs::rename(temporary, path)
+    fs::rename(temporary, path)?;
+    sync_dir(path.parent().unwrap_or(Path::new("")))
+}
+
+/// Brings the names in a directory to the disk: without that, a crash may undo a rename.
+///
+/// # Errors
+/// A directory that cannot be opened, or a disk that fails.
+pub fn sync_dir(dir: &Path) -> io::Result<()> {
+    // Elsewhere a directory cannot be opened like a file.
+    #[cfg(unix)]
+    {
+        let here = dir.as_os_str().is_empty();
+        File::open(if here { Path::new(".") } else { dir })?.sync_all()?;
+    }
+    #[cfg(not(unix))]
+    let _ = dir;
+    Ok(())
 }
 
 /// The file that `path` stands for: itself, or what a symbolic link leads to. A rename would replace a link,

@@ -13,6 +13,9 @@ use crate::plane::Plane;
 /// (Sec. 3.1).
 pub const FEATURES: usize = 12;
 
+/// The first of the texture channels; normals and positions lie before it.
+pub const TEXTURES: usize = 6;
+
 /// The feature channels in the network's order.
 pub const FEATURE_NAMES: [&str; FEATURES] = [
     "normal.x",

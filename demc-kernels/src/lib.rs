@@ -10,6 +10,7 @@
 //! whatever the number of threads. Lengths that do not fit are a bug of the caller and panic with the shapes.
 
 pub mod adam;
+pub mod average;
 pub mod batch_norm;
 pub mod conv1x1;
 pub mod conv3x3;

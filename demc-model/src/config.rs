@@ -37,6 +37,8 @@ pub enum Variant {
     DemcNosn,
     /// The single-encoder network (Fig. 4, Sec. 4.4).
     Semc,
+    /// SEMC without features: an encoder of the noisy colour. Ours, a control: what features bring is what it lacks.
+    ColorOnly,
 }
 
 /// Which reading of the paper, where its text and its authors' released model differ.
@@ -120,8 +122,13 @@ pub struct ReadingSpec {
 }
 
 impl Variant {
-    /// All variants, in the order of the paper.
-    pub const ALL: [Variant; 3] = [Variant::Demc, Variant::DemcNosn, Variant::Semc];
+    /// All variants, in the order of the paper, and the control.
+    pub const ALL: [Variant; 4] = [
+        Variant::Demc,
+        Variant::DemcNosn,
+        Variant::Semc,
+        Variant::ColorOnly,
+    ];
 
     /// THE table of variants.
     pub fn spec(self) -> &'static VariantSpec {
@@ -137,6 +144,10 @@ impl Variant {
             Variant::Semc => &VariantSpec {
                 name: "semc",
                 encoders: &[&[Input::DetailMap, Input::Color]],
+            },
+            Variant::ColorOnly => &VariantSpec {
+                name: "color-only",
+                encoders: &[&[Input::Color]],
             },
         }
     }
@@ -227,9 +238,9 @@ mod tests {
     }
 
     #[test]
-    fn only_nosn_has_no_fusion() {
+    fn only_those_that_eat_a_detail_map_make_one() {
         let with: Vec<bool> = Variant::ALL.map(|v| v.spec().has_fusion()).to_vec();
-        assert_eq!(with, [true, false, true]);
+        assert_eq!(with, [true, false, true, false]);
     }
 
     #[test]

@@ -18,11 +18,13 @@ pub mod fusion;
 pub mod inference;
 pub mod init;
 pub mod layers;
+pub mod loss;
 pub mod metrics;
 pub mod ops;
 pub mod weights;
 
 pub use config::{DOWNSAMPLING, Head, ModelConfig, Reading, Variant};
 pub use denoiser::Denoiser;
+pub use loss::Loss;
 pub use ops::Ops;
 pub use weights::{Weight, Weights, WeightsError};

@@ -1,12 +1,8 @@
-//! RelMSE as loss and metric (Eq. 5), SSIM as metric (Wang et al. 2004), and the way between gamma and HDR space.
+//! RelMSE (Eq. 5) and SSIM (Wang et al. 2004) of images.
 //!
 //! "RelMSE" and "SSIM" mean many things in this field. `relmse` here is the paper's: it **sums** over the three
 //! channels and averages over pixels, in linear HDR. `ssim` is taken on `clip(x, 0, 1)^(1 / 2.2)` with a data range of
 //! 1, over the windows that lie fully inside, and averaged over the channels (ours: the paper does not state it).
-
-use burn::tensor::Tensor;
-
-use crate::ops::{self, Ops};
 
 /// Epsilon of Eq. 5.
 pub const LOSS_EPSILON: f32 = 0.001;
@@ -19,40 +15,6 @@ pub const SSIM_WINDOW: usize = 11;
 
 /// Deviation of SSIM's Gaussian window, px.
 const SSIM_SIGMA: f64 = 1.5;
-
-/// Linear HDR of a network's output: `y^gamma`, the inverse of Eq. 4 for values that are not negative.
-///
-/// # Shapes
-/// Any to the same.
-pub fn hdr_from_gamma(image_gamma: Tensor<4>, gamma: f32) -> Tensor<4> {
-    image_gamma.powf_scalar(gamma)
-}
-
-/// The training loss (Eq. 5): `1/N sum (ref - out)^2 / (ref^2 + epsilon)`, N the number of pixels of the batch.
-///
-/// # Shapes
-/// Two `[B, 3, H, W]` in linear HDR to `[1]`.
-pub fn rel_mse(out_hdr: Tensor<4>, ref_hdr: Tensor<4>, epsilon: f32) -> Tensor<1> {
-    let [batch, _, height, width] = out_hdr.dims();
-    let difference = out_hdr - ref_hdr.clone();
-    let relative = difference.square() / ref_hdr.square().add_scalar(epsilon);
-    relative.sum().div_scalar((batch * height * width) as f32)
-}
-
-/// The training loss of a network's output: [`rel_mse`] of [`hdr_from_gamma`], in one operation with its gradient where the
-/// kernels run. The reference has no gradient there.
-///
-/// # Shapes
-/// `out_gamma` in gamma space and `ref_hdr` in linear HDR, `[B, 3, H, W]`, to `[1]`.
-pub fn loss(
-    ops: Ops,
-    out_gamma: Tensor<4>,
-    ref_hdr: Tensor<4>,
-    gamma: f32,
-    epsilon: f32,
-) -> Tensor<1> {
-    ops::rel_mse_of_gamma(ops, out_gamma, ref_hdr, gamma, epsilon)
-}
 
 /// `relmse` of an image (Eq. 5, epsilon 0.001), in float64.
 ///
@@ -181,7 +143,6 @@ fn gaussian() -> [f64; SSIM_WINDOW] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use burn::tensor::{Device, TensorData};
 
     fn pattern(len: usize, seed: u32) -> Vec<f32> {
         let mut state = seed;
@@ -204,25 +165,6 @@ mod tests {
     #[test]
     fn black_image_scores_nearly_three() {
         assert!((rel_mse_image(&[0.0; 12], &[10.0; 12]) - 3.0).abs() < 1e-4);
-    }
-
-    #[test]
-    fn loss_and_metric_agree() {
-        let (candidate, reference) = (pattern(2 * 3 * 20, 1), pattern(2 * 3 * 20, 2));
-        let tensor = |values: &[f32]| {
-            Tensor::<4>::from_data(
-                TensorData::new(values.to_vec(), [2, 3, 4, 5]),
-                &Device::flex(),
-            )
-        };
-        let loss: f32 = rel_mse(tensor(&candidate), tensor(&reference), LOSS_EPSILON).into_scalar();
-        let images = candidate.chunks(60).zip(reference.chunks(60));
-        let metric = images.map(|(c, r)| rel_mse_image(c, r)).sum::<f64>() / 2.0;
-        // float32 sums of 120 terms.
-        assert!(
-            (f64::from(loss) - metric).abs() < 1e-5 * metric,
-            "{loss} {metric}"
-        );
     }
 
     #[test]

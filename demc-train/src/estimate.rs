@@ -5,7 +5,7 @@ use std::fmt;
 use std::time::Instant;
 
 use burn::tensor::Device;
-use demc_data::{Batch, FEATURES};
+use demc_data::{Batch, FEATURES, Patch};
 
 use crate::config::Config;
 use crate::data::Data;
@@ -32,7 +32,7 @@ impl Estimate {
         let mut single = config.clone();
         single.train.grad_accumulation = 1;
         let model = initial_model(&config.model, 0, data.normalizer.flat_color, device);
-        let mut trainer = Trainer::new(&single, model, Adam::new(1e-8), device.clone());
+        let mut trainer = Trainer::new(&single, model, Adam::new(1e-8), None, device.clone());
         let patch = grey_patch(config.data.patch_size);
         let mut time = || {
             let started = Instant::now();
@@ -65,7 +65,11 @@ fn grey_patch(side: usize) -> Batch {
         color_gamma: planes(3),
         features_z: planes(FEATURES),
         reference_hdr: planes(3),
-        patches: Vec::new(),
+        patches: vec![Patch {
+            scene: 0,
+            y: 0,
+            x: 0,
+        }],
     }
 }
 

@@ -8,14 +8,20 @@
 pub mod checkpoint;
 pub mod config;
 pub mod data;
+pub mod ema;
 pub mod estimate;
 pub mod metrics_log;
 pub mod optimizer;
 pub mod progress;
+pub mod recorder;
 pub mod run_dir;
+mod running_statistics;
 pub mod schedule;
+pub mod signals;
+pub mod tensorboard;
 pub mod train;
 pub mod trainer;
 pub mod validation;
+pub mod watch;
 
 pub use config::Config;

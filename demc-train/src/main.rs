@@ -16,7 +16,7 @@ static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
 fn main() -> ExitCode {
     let arguments = cli::Arguments::parse();
     match within_pool(|| cli::run(arguments)) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(code) => code,
         Err(error) => {
             eprintln!("error: {error:#}");
             let usage =

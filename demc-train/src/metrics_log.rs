@@ -1,4 +1,4 @@
-//! `metrics.jsonl`: one object a line, nothing in it depends on the clock but `elapsed_s`.
+//! `metrics.jsonl`: one object a line; nothing in it depends on the clock but `patches_per_s` and `elapsed_s`.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::Write;
@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use demc_data::file::write_whole;
+use demc_model::config::DETAIL_CHANNELS;
 use serde::Serialize;
 
 /// `metrics.jsonl`, open for more.
@@ -13,16 +14,17 @@ use serde::Serialize;
 pub struct Metrics {
     file: File,
     path: PathBuf,
+    lost: bool,
 }
 
-/// One line of `metrics.jsonl`. Nothing depends on the clock but `elapsed_s`.
+/// One line of `metrics.jsonl`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Line {
     /// Steps taken.
     pub step: u64,
     /// Passes over the training patches.
     pub epoch: f64,
-    /// Mean training loss (Eq. 5) since the line before.
+    /// Mean training loss since the line before; `null` where every step of them was skipped.
     pub loss: f64,
     /// Learning rate of the last step.
     pub lr: f64,
@@ -34,8 +36,43 @@ pub struct Line {
     /// Mean SSIM of the validation scenes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub valid_ssim: Option<f64>,
+    /// Channels of the detail map that are zero in every validation scene.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub dead_channels: Option<usize>,
+    /// Share of the output's values that are zero where the reference is above 0.01.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub zero_share: Option<f64>,
+    /// Steps of the run that were skipped because they were not finite.
+    pub skipped: u64,
+    /// Patches a second since the line before, over the steps alone.
+    pub patches_per_s: f64,
     /// Seconds since the start, stops left out.
     pub elapsed_s: f64,
+}
+
+impl Line {
+    /// The line's numbers as TensorBoard's scalars.
+    pub fn scalars(&self) -> Vec<(&'static str, f64)> {
+        let always = [
+            ("train/loss", Some(self.loss)),
+            ("train/learning_rate", Some(self.lr)),
+            ("train/gradient_norm", Some(self.grad_norm)),
+            ("train/patches_per_s", Some(self.patches_per_s)),
+            ("train/skipped_steps", Some(self.skipped as f64)),
+        ];
+        let dead = self.dead_channels.map(|dead| dead as f64);
+        let validation = [
+            ("validation/RelMSE", self.valid_relmse),
+            ("validation/SSIM", self.valid_ssim),
+            (
+                "validation/dead_detail_channels",
+                dead.map(|dead| dead / DETAIL_CHANNELS as f64),
+            ),
+            ("validation/output_zero_share", self.zero_share),
+        ];
+        let all = always.into_iter().chain(validation);
+        all.filter_map(|(tag, value)| Some((tag, value?))).collect()
+    }
 }
 
 impl Metrics {
@@ -44,6 +81,7 @@ impl Metrics {
     /// # Errors
     /// A log that cannot be read or written.
     pub fn open(path: &Path, step: u64) -> anyhow::Result<Self> {
+        let lost = step > 0 && !path.exists();
         let text = if path.exists() {
             fs::read_to_string(path)
         } else {
@@ -61,7 +99,18 @@ impl Metrics {
         Ok(Metrics {
             file: file.with_context(|| path.display().to_string())?,
             path: path.to_owned(),
+            lost,
         })
+    }
+
+    /// The file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Whether the lines of the steps before were gone.
+    pub fn was_lost(&self) -> bool {
+        self.lost
     }
 
     /// Appends a line.
@@ -100,6 +149,10 @@ mod tests {
             grad_norm,
             valid_relmse: None,
             valid_ssim: None,
+            dead_channels: None,
+            zero_share: None,
+            skipped: 0,
+            patches_per_s: 9.0,
             elapsed_s,
         }
     }
@@ -128,5 +181,6 @@ mod tests {
             "{json}"
         );
         assert!(!json.contains("valid_"));
+        assert_eq!(line(1).scalars().len(), 5);
     }
 }

@@ -4,7 +4,8 @@
 //! config.toml       the resolved configuration: `demc-train --config RUN/config.toml` repeats the run
 //! layout.toml       the channel layout, where it is not a preset
 //! run.json          versions, device, scenes of each split, statistics of the training scenes
-//! metrics.jsonl     one object a line: step, epoch, loss, lr, grad_norm, elapsed_s; on validation valid_relmse, valid_ssim
+//! metrics.jsonl     one object a line, see `metrics_log`
+//! tensorboard/      the same and the pictures, for TensorBoard
 //! latest, checkpoints/, best.safetensors
 //! strips/           pictures of every validation and of the test split
 //! test.json         scores of the test split
@@ -19,6 +20,7 @@ use demc_data::file::write_whole;
 use demc_data::{ChannelLayout, Normalizer, Scene};
 use serde::{Deserialize, Serialize};
 
+use crate::checkpoint::Store;
 use crate::config::Config;
 use crate::data::Data;
 use crate::metrics_log::Metrics;
@@ -35,6 +37,10 @@ const METRICS: &str = "metrics.jsonl";
 const LAYOUT: &str = "layout.toml";
 /// Locked by the process that trains.
 const LOCK: &str = "lock";
+/// The files of a run that it is made of, copied into its checkpoints.
+pub const OWN_FILES: [&str; 3] = [CONFIG, RUN, LAYOUT];
+/// Ending of a hidden file that was being written.
+const TEMPORARY: &str = ".tmp";
 /// What shows that a directory holds a run.
 const TRACES: [&str; 4] = [RUN, METRICS, "checkpoints", "latest"];
 
@@ -120,15 +126,30 @@ pub struct Facts<'a> {
 impl RunDir {
     /// Refuses a directory that holds a run unless `resume` is set and the run has the same configuration.
     ///
-    /// Writes nothing: a refusal comes before the data is read.
+    /// Writes nothing: a refusal comes before the data is read. A configuration that is gone is looked for in the
+    /// checkpoints.
     ///
     /// # Errors
     /// As said, with every key that differs; a saved configuration that cannot be read.
     pub fn claim(config: &Config, resume: bool) -> anyhow::Result<Self> {
         let path = config.run.dir.clone();
-        let saved = path.join(CONFIG);
-        if saved.exists() {
-            let there = Config::load(&saved, &[])?;
+        let claimed = RunDir {
+            path: path.clone(),
+            lock: None,
+        };
+        let trace = OWN_FILES.iter().chain(&TRACES);
+        let Some(trace) = trace.into_iter().find(|name| path.join(name).exists()) else {
+            return Ok(claimed);
+        };
+        let saved = match path.join(CONFIG) {
+            saved if saved.exists() => Some(saved),
+            _ => {
+                let checkpoint = Store::new(&path).newest_intact()?.intact;
+                checkpoint.map(|dir| dir.join(CONFIG))
+            }
+        };
+        if let Some(saved) = &saved {
+            let there = Config::load(saved, &[])?;
             let differences = config.differences(&there);
             ensure!(
                 differences.is_empty(),
@@ -136,19 +157,39 @@ impl RunDir {
                 path.display(),
                 differences.join("; ")
             );
-            if !resume {
-                bail!(
-                    "{}: holds a run already; --resume continues it, --run-dir takes another directory",
-                    path.display()
-                );
-            }
-        } else if let Some(trace) = TRACES.iter().find(|name| path.join(name).exists()) {
+        }
+        if !resume {
             bail!(
-                "{}: holds a {trace} but no {CONFIG}: a run that lost it, or something else; take another directory",
+                "{}: holds a run already ({trace}); --resume continues it, --run-dir takes another directory",
                 path.display()
             );
         }
-        Ok(RunDir { path, lock: None })
+        Ok(claimed)
+    }
+
+    /// Locks the directory if it is there: from now on no other process trains in it.
+    ///
+    /// # Errors
+    /// Another process does.
+    pub fn lock_if_there(&mut self) -> anyhow::Result<()> {
+        if self.path.is_dir() {
+            self.lock()?;
+            self.sweep();
+        }
+        Ok(())
+    }
+
+    /// Removes what a process that was killed left half written. What cannot be removed does no harm.
+    fn sweep(&self) {
+        for dir in [self.path.clone(), self.path.join("strips")] {
+            for entry in fs::read_dir(dir).into_iter().flatten().flatten() {
+                let name = entry.file_name();
+                let name = name.to_string_lossy();
+                if name.starts_with('.') && name.ends_with(TEMPORARY) {
+                    let _ = fs::remove_file(entry.path());
+                }
+            }
+        }
     }
 
     /// The directory.
@@ -156,8 +197,8 @@ impl RunDir {
         &self.path
     }
 
-    /// Locks the directory, and writes configuration and record of a new run or compares the record of one that goes on.
-    /// Returns what the user should know about the latter.
+    /// Makes and locks the directory, and writes configuration and record of a new run or compares the record of one that
+    /// goes on. Returns what the user should know about the latter.
     ///
     /// # Errors
     /// A directory that cannot be written or that another process trains in; scenes, statistics or a layout other than
@@ -170,15 +211,19 @@ impl RunDir {
     ) -> anyhow::Result<Option<String>> {
         let made = fs::create_dir_all(&self.path);
         made.with_context(|| format!("cannot make {}", self.path.display()))?;
-        self.lock()?;
-        let record = self.path.join(RUN);
-        if !record.exists() {
+        if self.lock.is_none() {
+            self.lock()?;
+        }
+        if !self.path.join(CONFIG).exists() {
             let mut saved = config.clone();
             if config.data.layout.ends_with(".toml") {
                 self.write(LAYOUT, toml::to_string(&data.layout)?.as_bytes())?;
                 saved.data.layout = self.path.join(LAYOUT).to_string_lossy().into_owned();
             }
             self.write(CONFIG, saved.to_toml().as_bytes())?;
+        }
+        let record = self.path.join(RUN);
+        if !record.exists() {
             let written = Record::new(data, facts);
             self.write(RUN, &serde_json::to_vec_pretty(&written)?)?;
             return Ok(None);

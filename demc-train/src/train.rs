@@ -1,24 +1,36 @@
 //! The training loop.
 
+use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
+use burn::module::Module;
 use burn::tensor::Device;
 use demc_data::{BatchLoader, PatchSource};
 use demc_infer::bundle::locate::BEST;
-use demc_infer::bundle::{Bundle, BundleFile, BundleMeta, Names, Precision};
+use demc_infer::bundle::{Bundle, BundleMeta, Names, Precision};
 use demc_infer::evaluate::Report;
+use demc_model::Denoiser;
 
-use crate::checkpoint::{self, Best, Checkpoint, Means, State};
-use crate::config::Config;
+use crate::checkpoint::{self, Best, Checkpoint, Keep, Means, State, Store};
+use crate::config::{Config, OnNan, RunConfig};
 use crate::data::Data;
 use crate::metrics_log::Line;
 use crate::optimizer::Adam;
-use crate::progress::{Progress, say};
+use crate::recorder::{Recorder, timed};
 use crate::run_dir::{Facts, RunDir};
+use crate::signals::Signals;
 use crate::trainer::{Step, Trainer, initial_model};
-use crate::validation;
+use crate::validation::{self, Validation};
+use crate::watch::Setting;
+
+/// So many steps in a row that are not finite are the end of a run that skips them; ours.
+const MOST_SKIPPED: u64 = 100;
+/// Patches that an error names.
+const MOST_NAMED: usize = 8;
+/// Seconds of a minute.
+const MINUTE: f64 = 60.0;
 
 /// A run that is ready to go.
 pub struct Run {
@@ -28,6 +40,22 @@ pub struct Run {
     source: Arc<PatchSource>,
     trainer: Trainer,
     state: State,
+    /// Steps since one was taken.
+    skipped_in_a_row: u64,
+}
+
+/// How a training ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ended {
+    /// With its last step.
+    Done,
+    /// Because of a signal, after a checkpoint of this step.
+    Stopped {
+        /// The signal.
+        signal: i32,
+        /// The step.
+        step: u64,
+    },
 }
 
 impl Run {
@@ -50,9 +78,10 @@ impl Run {
             data.normalizer.clone(),
             config.train.seed,
         )?;
-        let (model, adam, state) = match checkpoint {
+        let (model, average, adam, state) = match checkpoint {
             Some(Checkpoint {
                 bundle,
+                average,
                 adam,
                 state,
             }) => {
@@ -63,11 +92,12 @@ impl Run {
                     "{}: the checkpoint has another network, layout or statistics than this run",
                     dir.path().display()
                 );
-                if state.best.is_some() {
-                    // Now, not when the last step is done.
-                    BundleFile::read(&dir.path().join(BEST))?;
-                }
-                (bundle.model, adam, state)
+                ensure!(
+                    average.is_some() == (config.train.ema > 0.0),
+                    "{}: the checkpoint and train.ema do not agree on whether there is an average",
+                    dir.path().display()
+                );
+                (bundle.model, average, adam, state)
             }
             None => {
                 let model = initial_model(
@@ -76,10 +106,11 @@ impl Run {
                     data.normalizer.flat_color,
                     &device,
                 );
-                (model, Adam::new(config.train.adam_epsilon), State::start())
+                let adam = Adam::new(config.train.adam_epsilon);
+                (model, None, adam, State::start())
             }
         };
-        let trainer = Trainer::new(&config, model, adam, device);
+        let trainer = Trainer::new(&config, model, adam, average, device);
         Ok(Run {
             config,
             data,
@@ -87,6 +118,7 @@ impl Run {
             source: Arc::new(source),
             trainer,
             state,
+            skipped_in_a_row: 0,
         })
     }
 
@@ -105,110 +137,194 @@ impl Run {
         self.trainer.model().parameter_count()
     }
 
-    /// Trains to the last step, recording on the way; `device` is the device's name, for the record.
+    /// Trains to the last step or the first signal, recording on the way; `device` is the device's name, for the record.
     ///
     /// # Errors
     /// A scene that cannot be read, a file that cannot be written, a loss that is not finite.
-    pub fn train(&mut self, device: &str) -> anyhow::Result<()> {
+    pub fn train(&mut self, device: &str) -> anyhow::Result<Ended> {
         let facts = Facts {
             device,
             operations: &self.trainer.operations(),
             parameters: self.parameters(),
             patches: self.patches(),
         };
-        if let Some(note) = self.dir.open(&self.config, &self.data, facts)? {
-            say(format!("note: {note}"));
+        let note = self.dir.open(&self.config, &self.data, facts)?;
+        let mut recorder =
+            Recorder::open(&self.dir, &self.config, self.state.step, self.patches())?;
+        if let Some(note) = note {
+            recorder.say(&format!("note: {note}"));
         }
         let (train, run) = (self.config.train.clone(), self.config.run.clone());
         let rate = self.config.learning_rate();
+        let names: Vec<String> = self
+            .data
+            .train
+            .iter()
+            .map(|scene| scene.name.clone())
+            .collect();
         let first_batch = self.state.step * train.grad_accumulation as u64;
         let mut loader = BatchLoader::new(self.source.clone(), first_batch);
-        let mut metrics = self.dir.metrics(self.state.step)?;
-        let progress = Progress::new(
-            self.state.step,
-            train.steps,
-            self.config.patches_per_step(),
-            self.patches(),
-        );
-        let (started, before) = (Instant::now(), self.state.elapsed_s);
+        let signals = Signals::listen()?;
+        let mut clock = Clock::new(self.state.elapsed_s);
         while self.state.step < train.steps {
             let lr = rate.at(self.state.step);
-            let step = self.trainer.step(lr, || loader.next())?;
-            self.count(step, lr)?;
+            let (step, time) = timed(|| self.trainer.step(lr, || loader.next()));
+            let step = step?;
+            let mut warnings = self.count(&step, lr, &names)?;
             let at = self.state.step;
-            progress.step(at, step.loss);
-            self.state.elapsed_s = before + started.elapsed().as_secs_f64();
+            recorder.step(at, step.loss, time);
+            self.state.elapsed_s = clock.elapsed();
             let due = |every: u64| at.is_multiple_of(every) || at == train.steps;
-            let scores = if due(run.validate_every) {
-                self.validate()?
-            } else {
-                None
-            };
-            if due(run.log_every) || scores.is_some() {
-                let line = self.line(lr, scores.as_ref());
-                metrics.append(&line)?;
-                self.state.since_log = Means::default();
-                progress.line(self.describe(&line));
+            let mut validation = None;
+            if due(run.validate_every) {
+                validation = self.validate(&mut recorder)?;
             }
-            if due(run.checkpoint_every) {
-                checkpoint::save(
-                    self.dir.path(),
-                    &self.bundle(),
-                    self.trainer.adam(),
-                    &self.state,
-                    run.keep,
-                )?;
+            if let Some(validation) = &validation {
+                warnings.extend(self.state.watch.validation(&validation.health));
+            }
+            if due(run.log_every) || validation.is_some() {
+                let line = self.line(lr, validation.as_ref());
+                recorder.line(line, &self.describe(&line))?;
+                self.state.since_log = Means::default();
+            }
+            for warning in warnings {
+                recorder.say(&format!("warning: step {at}: {warning}"));
+            }
+            let signal = signals.came();
+            if due(run.checkpoint_every) || clock.is_due(&run) || signal.is_some() {
+                self.save()?;
+                clock.saved();
+            }
+            if let Some(signal) = signal.filter(|_| at < train.steps) {
+                recorder.finish();
+                return Ok(Ended::Stopped { signal, step: at });
             }
         }
-        progress.finish();
-        Ok(())
+        recorder.finish();
+        Ok(Ended::Done)
     }
 
-    /// Takes a step into the state.
-    fn count(&mut self, step: Step, lr: f64) -> anyhow::Result<()> {
+    /// Takes a step into the state; returns what the user should know.
+    fn count(&mut self, step: &Step, lr: f64, names: &[String]) -> anyhow::Result<Vec<String>> {
         self.state.step += 1;
-        ensure!(
-            step.loss.is_finite() && step.grad_norm.is_finite(),
-            "step {}: loss {} and gradient norm {} at learning rate {lr:.3e}: not finite; the last checkpoint is good",
-            self.state.step,
-            step.loss,
-            step.grad_norm
-        );
+        if !step.is_finite() {
+            self.skipped_in_a_row += 1;
+            let skip = self.config.train.on_nan == OnNan::Skip;
+            if !skip || self.skipped_in_a_row >= MOST_SKIPPED {
+                bail!(self.not_finite(step, lr));
+            }
+            self.state.skipped += 1;
+            let text = format!("not finite, skipped: {}", self.patches_of(step));
+            return Ok(vec![text]);
+        }
+        self.skipped_in_a_row = 0;
         let means = &mut self.state.since_log;
         means.steps += 1;
         means.loss += step.loss;
         means.grad_norm += step.grad_norm;
-        Ok(())
+        let setting = Setting {
+            steps: self.config.train.steps,
+            patches: self.source.patches().len() as u64,
+            scenes: names,
+        };
+        let patches = step.patches.iter();
+        let patches = patches.map(|(patch, loss)| (patch.scene as usize, *loss));
+        Ok(self.state.watch.step(setting, step.loss, patches))
+    }
+
+    /// The error of a step that is not finite: everything that helps to find out why.
+    fn not_finite(&self, step: &Step, lr: f64) -> String {
+        let found = Store::new(self.dir.path()).newest_intact();
+        let good = match found.ok().and_then(|found| found.intact) {
+            Some(dir) => format!("the last good checkpoint is {}", dir.display()),
+            None => "there is no checkpoint yet".into(),
+        };
+        let row = match self.skipped_in_a_row {
+            1 => String::new(),
+            count => format!(", for {count} steps in a row"),
+        };
+        format!(
+            "step {}: loss {} and gradient norm {} at learning rate {lr:.3e}: not finite{row}; patches: {}; {good}; \
+             a smaller train.lr_start or train.grad_clip may help, --set train.on_nan=skip drops such steps",
+            self.state.step,
+            step.loss,
+            step.grad_norm,
+            self.patches_of(step)
+        )
+    }
+
+    /// Scene, origin and loss of a step's patches; those that are not finite alone, where there are such.
+    fn patches_of(&self, step: &Step) -> String {
+        let bad = |loss: f64| !loss.is_finite();
+        let any = step.patches.iter().any(|(_, loss)| bad(*loss));
+        let named = step.patches.iter().filter(|(_, loss)| !any || bad(*loss));
+        let mut texts: Vec<String> = named
+            .map(|(patch, loss)| {
+                let scene = &self.source.scenes()[patch.scene as usize].name;
+                format!("{scene} (x {}, y {}): {loss:.4}", patch.x, patch.y)
+            })
+            .collect();
+        if texts.len() > MOST_NAMED {
+            let more = texts.len() - MOST_NAMED;
+            texts.truncate(MOST_NAMED);
+            texts.push(format!("{more} more"));
+        }
+        texts.join(", ")
+    }
+
+    fn save(&self) -> anyhow::Result<()> {
+        let bundle = self.bundle_of(self.trainer.model().valid());
+        let average = self
+            .trainer
+            .average()
+            .cloned()
+            .map(|model| self.bundle_of(model));
+        let keep = Keep {
+            newest: self.config.run.keep,
+            every: self.config.run.keep_every,
+        };
+        checkpoint::save(
+            self.dir.path(),
+            &bundle,
+            average.as_ref(),
+            self.trainer.adam(),
+            &self.state,
+            keep,
+        )
     }
 
     /// Scores the validation scenes, draws them, and keeps the weights if they are the best so far.
-    fn validate(&mut self) -> anyhow::Result<Option<Report>> {
+    fn validate(&mut self, recorder: &mut Recorder) -> anyhow::Result<Option<Validation>> {
         if self.data.validation.is_empty() {
             return Ok(None);
         }
-        let bundle = self.bundle();
-        let (report, picture) =
-            validation::score(&bundle, &self.data.validation, validation::STRIP_SCENES)
-                .context("validation")?;
+        let bundle = self.bundle_of(self.trainer.result());
+        let found = validation::score(&bundle, &self.data.validation, validation::STRIP_SCENES)
+            .context("validation")?;
         let step = self.state.step;
-        if let Some(picture) = picture {
-            validation::write_strip(self.dir.path(), &format!("step-{step:08}.png"), &picture)?;
+        if let Some(picture) = &found.picture {
+            recorder.picture(step, picture)?;
         }
-        let relmse = report.mean.denoised.relmse;
+        let relmse = found.report.mean.denoised.relmse;
         if self.state.best.is_none_or(|best| relmse < best.relmse) {
-            bundle.save(&self.dir.path().join(BEST), Names::Burn, Precision::F32)?;
+            bundle.save(&self.best(), Names::Burn, Precision::F32)?;
             self.state.best = Some(Best { step, relmse });
         }
-        Ok(Some(report))
+        Ok(Some(found))
     }
 
-    fn line(&self, lr: f64, scores: Option<&Report>) -> Line {
+    fn best(&self) -> PathBuf {
+        self.dir.path().join(BEST)
+    }
+
+    fn line(&self, lr: f64, validation: Option<&Validation>) -> Line {
         let Means {
             steps,
             loss,
             grad_norm,
         } = self.state.since_log;
-        let denoised = scores.map(|report| report.mean.denoised);
+        let denoised = validation.map(|found| found.report.mean.denoised);
+        let health = validation.map(|found| found.health);
         Line {
             step: self.state.step,
             epoch: (self.state.step * self.config.patches_per_step()) as f64
@@ -218,6 +334,10 @@ impl Run {
             grad_norm: grad_norm / steps as f64,
             valid_relmse: denoised.map(|score| score.relmse),
             valid_ssim: denoised.and_then(|score| score.ssim),
+            dead_channels: health.and_then(|health| health.dead_channels),
+            zero_share: health.map(|health| health.zero_share),
+            skipped: self.state.skipped,
+            patches_per_s: 0.0,
             elapsed_s: self.state.elapsed_s,
         }
     }
@@ -234,19 +354,15 @@ impl Run {
         text
     }
 
-    /// The network as it stands, on the plain device, with all that belongs to it.
-    fn bundle(&self) -> Bundle {
-        use burn::module::Module;
+    /// A network of this run as it stands, with all that belongs to it.
+    fn bundle_of(&self, model: Denoiser) -> Bundle {
         let meta = BundleMeta::new(
             self.config.model,
             self.data.normalizer.clone(),
             self.data.layout.clone(),
             self.state.step,
         );
-        Bundle {
-            meta,
-            model: self.trainer.model().valid(),
-        }
+        Bundle { meta, model }
     }
 
     /// Scores the test split with the best weights (the last ones where nothing was validated); `None` without one.
@@ -258,18 +374,50 @@ impl Run {
         if self.data.test.is_empty() {
             return Ok(None);
         }
-        let best = self.dir.path().join(BEST);
         let bundle = match self.state.best {
-            Some(_) => Bundle::load(&best, device)?,
-            None => self.bundle(),
+            Some(_) => Bundle::load(&self.best(), device)?,
+            None => self.bundle_of(self.trainer.result()),
         };
-        let (report, picture) =
-            validation::score(&bundle, &self.data.test, usize::MAX).context("test")?;
+        let Validation {
+            report, picture, ..
+        } = validation::score(&bundle, &self.data.test, usize::MAX).context("test")?;
         if let Some(picture) = picture {
             validation::write_strip(self.dir.path(), "test.png", &picture)?;
         }
         self.dir
             .write("test.json", &serde_json::to_vec_pretty(&report)?)?;
         Ok(Some((bundle.meta.step, report)))
+    }
+}
+
+/// The clock of a session: what it adds to the run's time, and when a checkpoint is due by it.
+struct Clock {
+    started: Instant,
+    before: f64,
+    saved: Instant,
+}
+
+impl Clock {
+    fn new(before: f64) -> Self {
+        let now = Instant::now();
+        Clock {
+            started: now,
+            before,
+            saved: now,
+        }
+    }
+
+    /// Seconds of the run so far.
+    fn elapsed(&self) -> f64 {
+        self.before + self.started.elapsed().as_secs_f64()
+    }
+
+    fn saved(&mut self) {
+        self.saved = Instant::now();
+    }
+
+    fn is_due(&self, run: &RunConfig) -> bool {
+        let limit = Duration::from_secs_f64(run.checkpoint_minutes * MINUTE);
+        !limit.is_zero() && self.saved.elapsed() >= limit
     }
 }

@@ -1,32 +1,44 @@
-//! One optimizer step: batches, forward, loss (Eq. 5), backward, clipping, Adam.
+//! One optimizer step: batches, forward, loss (Eq. 5), backward, clipping, Adam, the average of the weights.
 
+use burn::module::Module;
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Device, Tensor, TensorData};
-use demc_data::{Batch, FEATURES};
-use demc_model::metrics;
+use demc_data::{Batch, FEATURES, Patch};
 use demc_model::{Denoiser, ModelConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::config::{Config, TrainConfig};
+use crate::ema::Ema;
 use crate::optimizer::{Adam, grad_norm, scaled};
+use crate::running_statistics::RunningStatistics;
 
 /// A network in training.
 pub struct Trainer {
     model: Option<Denoiser>,
     adam: Adam,
+    ema: Option<Ema>,
     device: Device,
     config: TrainConfig,
     gamma: f32,
 }
 
 /// What a step found.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Step {
-    /// Loss before the step, averaged over its batches.
+    /// Loss before the step, averaged over its patches.
     pub loss: f64,
-    /// Norm of the whole gradient, before clipping.
+    /// Norm of the whole gradient, before clipping; NaN where the loss was not finite.
     pub grad_norm: f64,
+    /// Every patch of the step, with its loss.
+    pub patches: Vec<(Patch, f64)>,
+}
+
+impl Step {
+    /// Whether loss and gradient were finite: if not, the step was not taken.
+    pub fn is_finite(&self) -> bool {
+        self.loss.is_finite() && self.grad_norm.is_finite()
+    }
 }
 
 /// The network that a run starts with: drawn from the run's seed, its grey head at the best flat image.
@@ -40,18 +52,28 @@ pub fn initial_model(
 }
 
 impl Trainer {
-    /// A trainer of `model`, which lives on `device`, with the optimizer's state so far.
+    /// A trainer of `model`, which lives on `device`, with the optimizer's state and the averaged network so far; a new
+    /// average starts at `model`.
     ///
     /// # Panics
     /// Where `device` has no autodiff.
-    pub fn new(config: &Config, model: Denoiser, adam: Adam, device: Device) -> Self {
+    pub fn new(
+        config: &Config,
+        model: Denoiser,
+        adam: Adam,
+        average: Option<Denoiser>,
+        device: Device,
+    ) -> Self {
         assert!(
             device.is_autodiff(),
             "training needs a device with autodiff"
         );
+        let decay = config.train.ema;
+        let ema = (decay > 0.0).then(|| Ema::new(decay, average.unwrap_or_else(|| model.valid())));
         Trainer {
             model: Some(model),
             adam,
+            ema,
             device,
             config: config.train.clone(),
             gamma: config.data.gamma,
@@ -70,32 +92,78 @@ impl Trainer {
         &self.adam
     }
 
+    /// The network to judge and to ship, on the plain device: the average, where there is one.
+    pub fn result(&self) -> Denoiser {
+        match &self.ema {
+            Some(ema) => ema.model().clone(),
+            None => self.model().valid(),
+        }
+    }
+
+    /// The averaged network, where there is one.
+    pub fn average(&self) -> Option<&Denoiser> {
+        self.ema.as_ref().map(Ema::model)
+    }
+
     /// The operations that run, in words.
     pub fn operations(&self) -> String {
         self.model().ops().describe(&self.device)
     }
 
-    /// Takes one step at learning rate `lr` on `train.grad_accumulation` batches.
+    /// Takes one step at learning rate `lr` on `train.grad_accumulation` batches. Where loss or gradient are not finite, the
+    /// network stays as it was, its running statistics too.
     ///
     /// # Errors
-    /// Those of `next_batch`; the network is then as before.
+    /// Those of `next_batch`; the weights are then as before.
     pub fn step<E>(
         &mut self,
         lr: f64,
         mut next_batch: impl FnMut() -> Result<Batch, E>,
     ) -> Result<Step, E> {
         let parts = self.config.grad_accumulation;
+        let statistics = RunningStatistics::of(self.model());
         let mut accumulated = GradientsAccumulator::new();
-        let mut loss = 0.0;
+        let mut patches = Vec::new();
+        let mut finite = true;
         for _ in 0..parts {
-            let part = self.loss(&next_batch()?).div_scalar(parts as f32);
-            let gradients = part.backward();
-            loss += f64::from(part.into_scalar::<f32>());
-            let model = self.model();
-            accumulated.accumulate(model, GradientsParams::from_grads(gradients, model));
+            let batch = next_batch()?;
+            let losses = self.losses(&batch);
+            let part = losses.clone().mean().div_scalar(parts as f32);
+            let host = losses.into_data().try_to_vec::<f32>();
+            let host = host.expect("losses are float32");
+            finite &= host.iter().all(|loss| loss.is_finite());
+            patches.extend(
+                batch
+                    .patches
+                    .into_iter()
+                    .zip(host.into_iter().map(f64::from)),
+            );
+            if finite {
+                let model = self.model();
+                let gradients = GradientsParams::from_grads(part.backward(), model);
+                accumulated.accumulate(model, gradients);
+            }
         }
-        let mut grads = accumulated.grads();
-        let norm = grad_norm(self.model(), &grads);
+        let loss = patches.iter().map(|(_, loss)| loss).sum::<f64>() / patches.len() as f64;
+        let mut step = Step {
+            loss,
+            grad_norm: f64::NAN,
+            patches,
+        };
+        if finite {
+            let grads = accumulated.grads();
+            step.grad_norm = grad_norm(self.model(), &grads);
+            if step.is_finite() {
+                self.descend(lr, grads, step.grad_norm);
+                return Ok(step);
+            }
+        }
+        self.model = self.model.take().map(|model| statistics.restore(model));
+        Ok(step)
+    }
+
+    /// Clips the gradient of norm `norm`, and moves weights and average.
+    fn descend(&mut self, lr: f64, mut grads: GradientsParams, norm: f64) {
         let limit = f64::from(self.config.grad_clip);
         if limit > 0.0 && norm > limit {
             grads = scaled(self.model(), grads, limit / norm);
@@ -104,15 +172,15 @@ impl Trainer {
             .model
             .take()
             .expect("the network is away only within a step");
-        self.model = Some(self.adam.step(lr, model, grads));
-        Ok(Step {
-            loss,
-            grad_norm: norm,
-        })
+        let model = self.adam.step(lr, model, grads);
+        if let Some(ema) = &mut self.ema {
+            ema.update(&model.valid(), self.adam.steps());
+        }
+        self.model = Some(model);
     }
 
-    /// The loss of a batch (Eq. 5), `[1]`.
-    fn loss(&self, batch: &Batch) -> Tensor<1> {
+    /// The loss of each patch of a batch, `[B]`.
+    fn losses(&self, batch: &Batch) -> Tensor<1> {
         let side = (batch.color_gamma.len() / (3 * batch.size)).isqrt();
         let tensor = |values: &[f32], channels| {
             let data = TensorData::new(values.to_vec(), [batch.size, channels, side, side]);
@@ -122,13 +190,11 @@ impl Trainer {
         let features_z = tensor(&batch.features_z, FEATURES);
         let ref_hdr = tensor(&batch.reference_hdr, 3);
         let out_gamma = self.model().forward(color_gamma, features_z);
-        metrics::loss(
-            self.model().ops(),
-            out_gamma,
-            ref_hdr,
-            self.gamma,
-            self.config.loss_epsilon,
-        )
+        let TrainConfig {
+            loss, loss_epsilon, ..
+        } = self.config;
+        let ops = self.model().ops();
+        loss.per_image(ops, out_gamma, ref_hdr, self.gamma, loss_epsilon)
     }
 }
 
@@ -161,14 +227,16 @@ mod tests {
             color_gamma: pattern(3, 0.0),
             features_z: pattern(12, 1.0),
             reference_hdr: pattern(3, 2.0),
-            patches: Vec::new(),
+            patches: (0..size as u32)
+                .map(|x| Patch { scene: 0, y: 0, x })
+                .collect(),
         }
     }
 
     fn trainer(config: &Config) -> Trainer {
         let device = Device::flex().autodiff();
         let model = initial_model(&config.model, 1, [0.3; 3], &device);
-        Trainer::new(config, model, Adam::new(1e-8), device)
+        Trainer::new(config, model, Adam::new(1e-8), None, device)
     }
 
     #[test]
@@ -238,5 +306,57 @@ mod tests {
             let Ok(_) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
             assert_eq!(place(&trainer), before);
         }
+    }
+
+    #[test]
+    fn every_patch_reports_its_loss() {
+        let step = trainer(&config(2, 2)).step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
+        let Ok(step) = step;
+        assert_eq!(step.patches.len(), 4);
+        let mean = step.patches.iter().map(|(_, loss)| loss).sum::<f64>() / 4.0;
+        assert_eq!(mean, step.loss);
+        assert!(step.patches[0].1 != step.patches[1].1);
+    }
+
+    /// Weights, running statistics, average and optimizer: a step along NaN leaves no trace.
+    #[test]
+    fn a_step_that_is_not_finite_is_not_taken() {
+        let mut config = config(2, 1);
+        config.model.variant = demc_model::Variant::Demc;
+        config.train.ema = 0.9;
+        let mut trainer = trainer(&config);
+        let Ok(_) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
+        let state = |trainer: &Trainer| {
+            let average = trainer.average().expect("an average").weights();
+            (trainer.model().weights(), average, trainer.adam().state())
+        };
+        let before = state(&trainer);
+        assert!(before.0.iter().any(|weight| !weight.is_trainable()));
+        let mut bad = batch(2, 0);
+        bad.features_z[40] = f32::NAN;
+        let Ok(step) = trainer.step(1e-3, || Ok::<_, Infallible>(bad.clone()));
+        assert!(!step.is_finite());
+        let unfinished: Vec<bool> = step.patches.iter().map(|(_, l)| l.is_finite()).collect();
+        assert_eq!(unfinished, [false, false], "batch normalisation spreads it");
+        assert!(state(&trainer) == before);
+        assert_eq!(trainer.adam().steps(), 1);
+        let Ok(step) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
+        assert!(step.is_finite() && state(&trainer) != before);
+    }
+
+    #[test]
+    fn the_average_is_what_ships() {
+        let mut config = config(2, 1);
+        let mut plain = trainer(&config);
+        config.train.ema = 0.5;
+        let mut averaged = trainer(&config);
+        for trainer in [&mut plain, &mut averaged] {
+            for _ in 0..3 {
+                let Ok(_) = trainer.step(1e-2, || Ok::<_, Infallible>(batch(2, 0)));
+            }
+        }
+        assert!(plain.model().weights() == averaged.model().weights());
+        assert!(plain.result().weights() == plain.model().weights());
+        assert!(averaged.result().weights() != averaged.model().weights());
     }
 }

@@ -7,21 +7,43 @@ use demc_data::{Scene, read_frame};
 use demc_infer::Bundle;
 use demc_infer::evaluate::{ImageScore, Report};
 use demc_infer::picture::Picture;
+use demc_model::config::DETAIL_CHANNELS;
+use serde::{Deserialize, Serialize};
 
 /// Scenes on a validation's picture; ours: the first ones, always the same.
 pub const STRIP_SCENES: usize = 3;
+
+/// Smallest reference that an output of zero is held against, linear HDR; ours.
+const NOT_BLACK: f32 = 0.01;
+
+/// What a validation found.
+pub struct Validation {
+    /// The scores.
+    pub report: Report,
+    /// Signs of a network that learns less than it could.
+    pub health: Health,
+    /// The first scenes, drawn; `None` where none were asked for.
+    pub picture: Option<Picture>,
+}
+
+/// Signs of a network that learns less than it could.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Health {
+    /// Channels of the detail map that are zero at every pixel of every scene; `None` for a network without one.
+    pub dead_channels: Option<usize>,
+    /// Share of the output's values that are zero where the reference is above 0.01.
+    pub zero_share: f64,
+}
 
 /// Denoises and scores `scenes`, one in memory at a time, and draws the first `strips` of them.
 ///
 /// # Errors
 /// A scene that cannot be read or has no reference.
-pub fn score(
-    bundle: &Bundle,
-    scenes: &[Scene],
-    strips: usize,
-) -> anyhow::Result<(Report, Option<Picture>)> {
+pub fn score(bundle: &Bundle, scenes: &[Scene], strips: usize) -> anyhow::Result<Validation> {
     let mut scores = Vec::with_capacity(scenes.len());
     let mut rows = Vec::new();
+    let mut alive = [false; DETAIL_CHANNELS];
+    let (mut zeros, mut bright) = (0usize, 0usize);
     for (index, scene) in scenes.iter().enumerate() {
         let frame = read_frame(&scene.path, &bundle.meta.layout)?;
         let denoised = bundle.denoise(&frame)?;
@@ -29,13 +51,32 @@ pub fn score(
             name: scene.name.clone(),
             ..ImageScore::new(&frame, &denoised, scene.ref_residual_relmse)?
         });
+        for (out, reference) in denoised.iter().zip(frame.reference.iter().flatten()) {
+            bright += usize::from(*reference > NOT_BLACK);
+            zeros += usize::from(*reference > NOT_BLACK && *out == 0.0);
+        }
+        let detail_map = bundle.detail_map(&frame)?;
+        if let Some(map) = &detail_map {
+            let channels = map.chunks_exact(map.len() / DETAIL_CHANNELS);
+            for (alive, channel) in alive.iter_mut().zip(channels) {
+                *alive |= channel.iter().any(|value| *value > 0.0);
+            }
+        }
         if index < strips {
-            let detail_map = bundle.detail_map(&frame)?;
             rows.push(Picture::strip(&frame, detail_map.as_deref(), &denoised));
         }
     }
     let picture = (!rows.is_empty()).then(|| Picture::above(&rows));
-    Ok((Report::new(scores), picture))
+    let has_map = bundle.meta.model.variant.spec().has_fusion();
+    let health = Health {
+        dead_channels: has_map.then(|| alive.iter().filter(|alive| !**alive).count()),
+        zero_share: zeros as f64 / bright.max(1) as f64,
+    };
+    Ok(Validation {
+        report: Report::new(scores),
+        health,
+        picture,
+    })
 }
 
 /// Writes a picture into the run directory.

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use common::{command, config, error_line, stderr, train};
 
-/// `metrics.jsonl` without `elapsed_s`, the one thing that depends on the clock.
+/// `metrics.jsonl` without what depends on the clock.
 fn metrics(run: &Path) -> Vec<serde_json::Value> {
     let text = fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
     let lines = text
@@ -17,10 +17,10 @@ fn metrics(run: &Path) -> Vec<serde_json::Value> {
         .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
     lines
         .map(|mut line| {
-            line.as_object_mut()
-                .expect("an object")
-                .remove("elapsed_s")
-                .expect("a time");
+            for key in ["elapsed_s", "patches_per_s"] {
+                let line = line.as_object_mut().expect("an object");
+                line.remove(key).expect("a time");
+            }
             line
         })
         .collect()
@@ -67,6 +67,7 @@ fn killed_and_resumed_equals_undisturbed() {
     for file in [
         "best.safetensors",
         "checkpoints/step-00000012/model.safetensors",
+        "checkpoints/step-00000012/average.safetensors",
         "checkpoints/step-00000012/optimizer.safetensors",
         "test.json",
     ] {
@@ -124,41 +125,111 @@ fn run_directories_are_not_mixed_up() {
     );
 }
 
+/// Whatever is lost or damaged, the run goes on: at worst from the checkpoint before, and says so.
 #[test]
-fn damaged_checkpoints_are_refused_by_name() {
+fn lost_and_damaged_files_cost_one_checkpoint_at_most() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    let (whole, run) = (dir.path().join("whole"), dir.path().join("run"));
+    assert!(train(&config, &whole, &[]).status.success());
+    let expected = |file: &str| fs::read(whole.join(file)).expect(file);
+    let last = "checkpoints/step-00000012";
+    let before = "checkpoints/step-00000009";
+
+    assert!(train(&config, &run, &[]).status.success());
+    let half = |path: &Path| {
+        let bytes = fs::read(path).expect("a file");
+        fs::write(path, &bytes[..bytes.len() / 2]).expect("a file");
+    };
+    let remove = |path: &Path| match path.is_dir() {
+        true => fs::remove_dir_all(path).expect("a directory"),
+        false => fs::remove_file(path).expect("a file"),
+    };
+    let model = format!("{last}/model.safetensors");
+    let optimizer = format!("{last}/optimizer.safetensors");
+    let state = format!("{last}/state.json");
+    let sums = format!("{last}/SHA256SUMS");
+    type Harm<'a> = &'a dyn Fn(&Path);
+    let harms: [(&str, Harm, &str); 12] = [
+        (&model, &half, "model.safetensors: damaged"),
+        (&optimizer, &half, "optimizer.safetensors: damaged"),
+        (&state, &half, "state.json: damaged"),
+        (&state, &remove, "state.json: No such file"),
+        (&sums, &remove, "SHA256SUMS: No such file"),
+        (last, &remove, "names `step-00000012`, which is not there"),
+        ("latest", &remove, "latest: No such file"),
+        ("config.toml", &remove, "config.toml was gone"),
+        ("run.json", &remove, "run.json was gone"),
+        ("best.safetensors", &remove, "best.safetensors was gone"),
+        ("best.safetensors", &half, ""),
+        ("metrics.jsonl", &remove, "metrics.jsonl was gone"),
+    ];
+    for (file, harm, words) in harms {
+        harm(&run.join(file));
+        let output = train(&config, &run, &["--resume"]);
+        assert!(output.status.success(), "{file}: {}", stderr(&output));
+        let text = String::from_utf8_lossy(&output.stdout);
+        assert!(text.contains(words), "{file}: {words}: {text}");
+        for file in [&*model, &*optimizer, "best.safetensors", "test.json"] {
+            let same = fs::read(run.join(file)).expect(file) == expected(file);
+            assert!(same, "{file} differs after {words}");
+        }
+    }
+    assert!(metrics(&run).is_empty(), "the log is not made up");
+
+    half(&run.join(&model));
+    half(&run.join(before).join("state.json"));
+    let error = error_line(&train(&config, &run, &["--resume"]), 1);
+    assert!(
+        error.contains("no checkpoint is whole")
+            && error.contains("step-00000012/model.safetensors")
+            && error.contains("step-00000009/state.json"),
+        "{error}"
+    );
+}
+
+#[test]
+fn checkpoints_of_another_format_are_refused() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let run = dir.path().join("run");
     let set = ["--set", "train.steps=3"];
     assert!(train(&config, &run, &set).status.success());
     let checkpoint = run.join("checkpoints/step-00000003");
-    let refused = |file: &str, damage: &dyn Fn(Vec<u8>) -> Vec<u8>, words: &str| {
-        let path = checkpoint.join(file);
-        let good = fs::read(&path).expect(file);
-        fs::write(&path, damage(good.clone())).expect(file);
-        let error = error_line(&train(&config, &run, &["--resume", set[0], set[1]]), 1);
-        assert!(error.contains(file) && error.contains(words), "{error}");
-        fs::write(&path, good).expect(file);
-    };
-    let half = |bytes: Vec<u8>| bytes[..bytes.len() / 2].to_vec();
-    refused("model.safetensors", &half, "");
-    refused("optimizer.safetensors", &half, "");
-    refused("state.json", &half, "");
-    let other_version = |bytes: Vec<u8>| {
-        String::from_utf8_lossy(&bytes)
-            .replace("\"format\": 1", "\"format\": 99")
-            .into_bytes()
-    };
-    refused(
-        "state.json",
-        &other_version,
-        "format 99; this build reads format 1",
-    );
+    let state = checkpoint.join("state.json");
+    let text = fs::read_to_string(&state).expect("a state");
+    fs::write(&state, text.replace("\"format\": 2", "\"format\": 99")).expect("a state");
+    // As a later version would have written it.
+    let sums = std::process::Command::new("sha256sum")
+        .current_dir(&checkpoint)
+        .args(["model.safetensors", "optimizer.safetensors", "state.json"])
+        .output()
+        .expect("sha256sum");
+    fs::write(checkpoint.join("SHA256SUMS"), sums.stdout).expect("sums");
+    let error = error_line(&train(&config, &run, &["--resume", set[0], set[1]]), 1);
     assert!(
-        train(&config, &run, &["--resume", set[0], set[1]])
-            .status
-            .success()
+        error.contains("state.json: format 99; this build reads format 2"),
+        "{error}"
     );
+}
+
+/// What is written is what `sha256sum -c` accepts.
+#[test]
+fn checksums_are_those_of_sha256sum() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let run = dir.path().join("run");
+    let set = ["--set", "train.steps=4"];
+    assert!(train(&config(dir.path()), &run, &set).status.success());
+    let output = std::process::Command::new("sha256sum")
+        .current_dir(run.join("checkpoints/step-00000004"))
+        .args(["--strict", "-c", "SHA256SUMS"])
+        .output()
+        .expect("sha256sum");
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{text}");
+    for file in ["model", "average", "optimizer", "best"] {
+        assert!(text.contains(&format!("{file}.safetensors: OK")), "{text}");
+    }
 }
 
 #[test]
@@ -198,18 +269,9 @@ fn what_a_run_lost_or_changed_is_named() {
     );
     fs::write(&layout, text).expect("a layout");
 
-    fs::rename(run.join("latest"), dir.path().join("latest")).expect("a rename");
-    let error = error_line(&train(&config, &run, &resume), 1);
-    assert!(error.contains("latest: missing"), "{error}");
-    fs::rename(dir.path().join("latest"), run.join("latest")).expect("a rename");
-
     let lock = fs::File::create(run.join("lock")).expect("a lock");
     lock.try_lock().expect("nobody trains");
     let error = error_line(&train(&config, &run, &resume), 1);
     assert!(error.contains("another process"), "{error}");
     drop(lock);
-
-    fs::remove_file(run.join("config.toml")).expect("a file");
-    let error = error_line(&train(&config, &run, &args), 1);
-    assert!(error.contains("no config.toml"), "{error}");
 }

@@ -1,4 +1,4 @@
-"""DEMC, DEMCnoSN and SEMC as PyTorch modules, in both readings of the paper.
+"""DEMC, DEMCnoSN, SEMC and color-only as PyTorch modules, in both readings of the paper.
 
 Everything is NCHW. Level i = 1..5 of an encoder has ``width * (1, 2, 4, 8, 8)`` channels at 1, 1/2, 1/4, 1/8 and 1/16
 of the input's resolution; the latent sits at 1/32, so heights and widths must be multiples of 32. Attribute names are
@@ -40,6 +40,7 @@ VARIANTS = {
     "demc": Variant(fusion=True, encoders=(("detail",), ("color",))),
     "demc-nosn": Variant(fusion=False, encoders=(("features",), ("color",))),  # Sec. 4.3
     "semc": Variant(fusion=True, encoders=(("detail", "color"),)),  # Sec. 4.4, Fig. 4
+    "color-only": Variant(fusion=False, encoders=(("color",),)),  # a control of ours
 }
 CHANNELS = {"detail": 3, "color": 3, "features": FEATURES}
 

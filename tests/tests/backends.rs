@@ -19,7 +19,8 @@ use burn::module::Module;
 use burn::optim::GradientsParams;
 use burn::tensor::Device;
 use demc_infer::device::{self, DeviceError};
-use demc_model::metrics::{LOSS_EPSILON, loss};
+use demc_model::Loss;
+use demc_model::metrics::LOSS_EPSILON;
 use demc_model::ops::{Isa, Ops};
 use demc_model::{Reading, Variant};
 
@@ -98,7 +99,9 @@ fn run(way: &Way, variant: Variant, reading: Reading) -> BTreeMap<String, Vec<f3
     let [color_gamma, features_z] = images(&device);
     let output = model.forward(color_gamma, features_z);
     let reference_hdr = inputs.tensor("reference_hdr", &device);
-    let loss = loss(way.ops, output.clone(), reference_hdr, 2.2, LOSS_EPSILON);
+    let ops = way.ops;
+    let losses = Loss::RelMse.per_image(ops, output.clone(), reference_hdr, 2.2, LOSS_EPSILON);
+    let loss = losses.mean();
     let gradients = GradientsParams::from_grads(loss.backward(), &model);
     let mut found = gradients_by_name(&model, &gradients);
     found.insert("output in evaluation".into(), host(evaluated));

@@ -5,9 +5,10 @@ use std::collections::HashMap;
 use demc_model::Weight;
 use half::f16;
 use half::slice::HalfFloatSliceExt;
-use safetensors::tensor::{Dtype, TensorView};
+use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
 
+use super::tensors::{Encoded, f32_bytes, serialize};
 use super::{BundleError, BundleMeta};
 
 /// The header's metadata key that makes a safetensors file a bundle.
@@ -109,26 +110,23 @@ pub(super) fn encode(
     names: Names,
     precision: Precision,
 ) -> Result<Vec<u8>, BundleError> {
-    let refused = |error: &dyn std::fmt::Display| BundleError::Encode(error.to_string());
-    let header = serde_json::to_string(&Header { meta, names }).map_err(|e| refused(&e))?;
+    let header = serde_json::to_string(&Header { meta, names });
+    let header = header.map_err(|error| BundleError::Encode(error.to_string()))?;
     let mut tensors = Vec::with_capacity(weights.len());
     for weight in weights {
         let dtype = precision.dtype(&weight.name);
-        let bytes = match dtype {
-            Dtype::F16 => f16_bytes(&weight)?,
-            _ => weight.data.iter().flat_map(|v| v.to_le_bytes()).collect(),
-        };
-        tensors.push((names.from_burn(&weight.name), dtype, weight.shape, bytes));
+        tensors.push(Encoded {
+            name: names.from_burn(&weight.name),
+            dtype,
+            bytes: match dtype {
+                Dtype::F16 => f16_bytes(&weight)?,
+                _ => f32_bytes(&weight.data),
+            },
+            shape: weight.shape,
+        });
     }
-    let views = tensors
-        .iter()
-        .map(|(name, dtype, shape, bytes)| {
-            Ok((name, TensorView::new(*dtype, shape.clone(), bytes)?))
-        })
-        .collect::<Result<Vec<_>, safetensors::SafeTensorError>>()
-        .map_err(|e| refused(&e))?;
     let metadata = HashMap::from([(KEY.to_string(), header)]);
-    safetensors::serialize(views, Some(metadata)).map_err(|e| refused(&e))
+    serialize(&tensors, Some(metadata)).map_err(BundleError::Encode)
 }
 
 fn f16_bytes(weight: &Weight) -> Result<Vec<u8>, BundleError> {

@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 
 use demc_data::frame::FEATURE_NAMES;
 use demc_model::Weight;
-use half::f16;
 use safetensors::SafeTensors;
-use safetensors::tensor::{Dtype, TensorView};
+use safetensors::tensor::Dtype;
 use serde::Deserialize;
 
 use super::encode::KEY;
+use super::tensors::values;
 use super::{BundleError, BundleMeta, FORMAT, Names, Precision, locate};
 
 /// What a bundle file holds, checked as far as that goes without building the network.
@@ -75,30 +75,6 @@ impl BundleFile {
             precision,
             weights,
         })
-    }
-}
-
-/// The values of a tensor as f32, or what is wrong with them.
-fn values(view: &TensorView<'_>) -> Result<Vec<f32>, String> {
-    let bytes = view.data();
-    let data: Vec<f32> = match view.dtype() {
-        Dtype::F32 => bytes
-            .as_chunks()
-            .0
-            .iter()
-            .map(|b| f32::from_le_bytes(*b))
-            .collect(),
-        Dtype::F16 => bytes
-            .as_chunks()
-            .0
-            .iter()
-            .map(|b| f16::from_le_bytes(*b).to_f32())
-            .collect(),
-        other => return Err(format!("type {other}; expected F32 or F16")),
-    };
-    match data.iter().find(|value| !value.is_finite()) {
-        Some(value) => Err(format!("{value} among its values")),
-        None => Ok(data),
     }
 }
 

@@ -3,8 +3,11 @@
 //! ```text
 //! RUN/best.safetensors                                   the best weights of validation
 //! RUN/latest                                             text: name of the newest checkpoint, step-00000500
-//! RUN/checkpoints/step-00000500/model.safetensors        a checkpoint
+//! RUN/checkpoints/step-00000500/average.safetensors      its averaged network, where the run has one: that is meant
+//! RUN/checkpoints/step-00000500/model.safetensors        its network in training
 //! ```
+//!
+//! A checkpoint also holds the best weights so far, which are not its own.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -17,7 +20,9 @@ pub const BEST: &str = "best.safetensors";
 pub const LATEST: &str = "latest";
 /// Directory of a run with the checkpoints.
 pub const CHECKPOINTS: &str = "checkpoints";
-/// Weights of a checkpoint.
+/// Averaged weights of a checkpoint.
+pub const AVERAGE: &str = "average.safetensors";
+/// Weights in training of a checkpoint.
 pub const MODEL: &str = "model.safetensors";
 
 /// The bundle file that `path` stands for.
@@ -28,11 +33,12 @@ pub(super) fn locate(path: &Path) -> Result<PathBuf, BundleError> {
     if !path.is_dir() {
         return Ok(path.into());
     }
-    for file in [BEST, MODEL] {
-        let file = path.join(file);
-        if file.exists() {
-            return Ok(file);
-        }
+    if let Some(file) = of_checkpoint(path) {
+        return Ok(file);
+    }
+    let best = path.join(BEST);
+    if best.exists() {
+        return Ok(best);
     }
     let latest = path.join(LATEST);
     if !latest.exists() {
@@ -42,7 +48,14 @@ pub(super) fn locate(path: &Path) -> Result<PathBuf, BundleError> {
         path: latest,
         source,
     })?;
-    Ok(path.join(CHECKPOINTS).join(checkpoint.trim()).join(MODEL))
+    let checkpoint = path.join(CHECKPOINTS).join(checkpoint.trim());
+    Ok(of_checkpoint(&checkpoint).unwrap_or_else(|| checkpoint.join(MODEL)))
+}
+
+/// The weights that a checkpoint stands for; `None` where `dir` is none.
+fn of_checkpoint(dir: &Path) -> Option<PathBuf> {
+    let mut files = [AVERAGE, MODEL].map(|file| dir.join(file)).into_iter();
+    files.find(|file| file.exists())
 }
 
 #[cfg(test)]
@@ -67,6 +80,12 @@ mod tests {
 
         fs::write(&model, "")?;
         assert_eq!(locate(&checkpoint).expect("checkpoint"), model);
+
+        let average = checkpoint.join("average.safetensors");
+        fs::write(&average, "")?;
+        fs::write(checkpoint.join("best.safetensors"), "")?;
+        assert_eq!(locate(&checkpoint).expect("checkpoint"), average);
+        assert_eq!(locate(run).expect("latest"), average);
 
         let best = run.join("best.safetensors");
         fs::write(&best, "")?;

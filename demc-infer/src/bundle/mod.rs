@@ -12,6 +12,7 @@ mod encode;
 mod error;
 mod file;
 pub mod locate;
+pub mod tensors;
 
 use std::io::Write;
 use std::path::Path;
@@ -79,9 +80,17 @@ impl Bundle {
     /// # Errors
     /// A weight that f16 cannot hold (before anything is written), or a path that cannot be written.
     pub fn save(&self, path: &Path, names: Names, precision: Precision) -> Result<(), BundleError> {
-        let bytes = encode::encode(&self.meta, self.model.weights(), names, precision)?;
+        let bytes = self.to_bytes(names, precision)?;
         demc_data::file::write_whole(path, |file| file.write_all(&bytes))?;
         Ok(())
+    }
+
+    /// The bytes of the bundle's file. Equal bundles give equal bytes.
+    ///
+    /// # Errors
+    /// A weight that f16 cannot hold.
+    pub fn to_bytes(&self, names: Names, precision: Precision) -> Result<Vec<u8>, BundleError> {
+        encode::encode(&self.meta, self.model.weights(), names, precision)
     }
 
     /// [`save`](Self::save), then reads the file back and compares: metadata and f32 tensors bit for bit, f16

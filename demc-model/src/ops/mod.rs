@@ -10,8 +10,10 @@
 //! | `kernels/` | the kernels as a Burn backend extension for `flex`, with gradients |
 //! | `stock` | the same operations made of Burn's |
 //! | `adam` | the optimizer's step and the norm of a gradient, in place where the kernels run |
+//! | `average` | the moving average of weights, likewise |
 
 pub mod adam;
+pub mod average;
 mod kernels;
 mod maps;
 mod stock;
@@ -108,11 +110,11 @@ impl FromStr for Ops {
     }
 }
 
-/// RelMSE (Eq. 5) of a network's output in gamma space against a reference in linear HDR; see
-/// [`metrics::loss`](crate::metrics::loss).
+/// RelMSE (Eq. 5) of each image of a network's output in gamma space against a reference in linear HDR; see
+/// [`Loss`](crate::Loss).
 ///
 /// # Shapes
-/// Two `[B, 3, H, W]` to `[1]`.
+/// Two `[B, 3, H, W]` to `[B]`.
 pub(crate) fn rel_mse_of_gamma(
     ops: Ops,
     out_gamma: Tensor<4>,

@@ -5,7 +5,7 @@ use burn::nn::conv::{Conv2d, ConvTranspose2d};
 use burn::tensor::{Tensor, activation, module::max_pool2d, ops::MaxPoolOptions};
 
 use super::Activation;
-use crate::metrics::{hdr_from_gamma, rel_mse};
+use crate::loss::{hdr_from_gamma, rel_mse};
 
 pub(super) fn conv(x: Tensor<4>, conv: &Conv2d, activation: Activation) -> Tensor<4> {
     activated(conv.forward(x), activation)

@@ -5,8 +5,8 @@ mod draw;
 use burn::module::Param;
 use burn::nn::BatchNorm;
 use burn::tensor::{Device, Tensor};
+use demc_model::Loss;
 use demc_model::Ops;
-use demc_model::metrics;
 use demc_model::ops::adam::{Moments, Rule, sum_of_squares};
 use demc_model::ops::{Activation, Maps};
 use draw::{Draw, device, host};
@@ -242,7 +242,8 @@ fn loss_is_burns() {
             let output = draw.tensor(shape, &device()).clamp_min(0.0).require_grad();
             let reference = draw.tensor(shape, &device()).clamp_min(0.0) * 3.0;
             // Half of it, as with gradient accumulation.
-            let loss = metrics::loss(ops, output.clone(), reference, 2.2, 1e-3) / 2.0;
+            let loss = Loss::RelMse.per_image(ops, output.clone(), reference, 2.2, 1e-3);
+            let loss = loss.mean() / 2.0;
             let gradients = loss.backward();
             let gradient = output.grad(&gradients).expect("by the output");
             vec![

@@ -9,7 +9,7 @@ mod source;
 use std::path::{Path, PathBuf};
 
 use demc_data::DataConfig;
-use demc_model::ModelConfig;
+use demc_model::{Loss, ModelConfig};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -29,6 +29,8 @@ const LOG_EVERY: u64 = 50;
 const VALIDATE_EVERY: u64 = 1000;
 /// Ours: a stopped run loses at most as much as between two validations.
 const CHECKPOINT_EVERY: u64 = 1000;
+/// Ours: what anybody can bear to lose.
+const CHECKPOINT_MINUTES: f64 = 15.0;
 /// Ours: the last one may be the one that was being written.
 const KEEP: usize = 2;
 
@@ -65,12 +67,19 @@ pub struct TrainConfig {
     pub decay: Decay,
     /// Adam's epsilon.
     pub adam_epsilon: f32,
+    /// What is minimised.
+    pub loss: Loss,
     /// Epsilon of the loss (Eq. 5).
     pub loss_epsilon: f32,
     /// Batches whose gradients are averaged in one step: a step sees `data.batch_size * grad_accumulation` patches.
     pub grad_accumulation: usize,
     /// Largest norm of the whole gradient; a longer one is shortened to it. 0: no limit, as in the paper.
     pub grad_clip: f32,
+    /// Share of the moving average of the weights that a step keeps, from 0 to below 1. 0: no average, as in the paper. With
+    /// one, validation, test and `demc-infer` use the averaged weights.
+    pub ema: f64,
+    /// What happens at a loss or gradient that is not finite.
+    pub on_nan: OnNan,
     /// Seed of weights, validation scenes, shuffling and augmentation.
     pub seed: u64,
 }
@@ -84,12 +93,26 @@ impl Default for TrainConfig {
             lr_end: LR_END,
             decay: Decay::Exponential,
             adam_epsilon: ADAM_EPSILON,
+            loss: Loss::default(),
             loss_epsilon: demc_model::metrics::LOSS_EPSILON,
             grad_accumulation: 1,
             grad_clip: 0.0,
+            ema: 0.0,
+            on_nan: OnNan::default(),
             seed: 1,
         }
     }
+}
+
+/// What happens at a loss or gradient that is not finite.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum OnNan {
+    /// The run stops and names the scenes.
+    #[default]
+    Stop,
+    /// The step is not taken, and counted.
+    Skip,
 }
 
 /// The `[run]` table.
@@ -104,8 +127,12 @@ pub struct RunConfig {
     pub validate_every: u64,
     /// Steps between two checkpoints.
     pub checkpoint_every: u64,
+    /// Minutes after which a checkpoint is due, whatever the steps; 0: steps alone count.
+    pub checkpoint_minutes: f64,
     /// How many of the newest checkpoints stay; the best weights of validation stay beside them.
     pub keep: usize,
+    /// Checkpoints whose step is a multiple of this stay for good; 0: none.
+    pub keep_every: u64,
 }
 
 impl Default for RunConfig {
@@ -115,7 +142,9 @@ impl Default for RunConfig {
             log_every: LOG_EVERY,
             validate_every: VALIDATE_EVERY,
             checkpoint_every: CHECKPOINT_EVERY,
+            checkpoint_minutes: CHECKPOINT_MINUTES,
             keep: KEEP,
+            keep_every: 0,
         }
     }
 }
@@ -211,6 +240,12 @@ impl Config {
             &clip,
             "0 (off) or a positive number",
         );
+        require(
+            (0.0..1.0).contains(&train.ema),
+            "train.ema",
+            &train.ema,
+            "from 0 (off) to below 1",
+        );
         for (key, value, most) in [
             ("train.steps", train.steps, MOST_STEPS),
             (
@@ -226,6 +261,19 @@ impl Config {
             let allowed = format!("from 1 to {most}");
             require((1..=most).contains(&value), key, &value, &allowed);
         }
+        let minutes = run.checkpoint_minutes;
+        require(
+            minutes.is_finite() && minutes >= 0.0,
+            "run.checkpoint_minutes",
+            &minutes,
+            "0 (off) or a positive number",
+        );
+        require(
+            run.keep_every <= MOST_STEPS,
+            "run.keep_every",
+            &run.keep_every,
+            "at most 1000000000",
+        );
         let seed = train.seed <= i64::MAX as u64;
         require(
             seed,
@@ -265,13 +313,19 @@ impl Config {
 
     /// The keys by which a run of `self` would differ from one of `other`; empty if one may continue the other.
     ///
-    /// Where the run and its data are kept (scenes, statistics and layout are compared on their own), how many checkpoints
-    /// stay, and threads and memory of the loader change no number.
+    /// Where the run and its data are kept (scenes, statistics and layout are compared on their own), when checkpoints are
+    /// written and which stay, what happens at a step that is not finite, and threads and memory of the loader change no
+    /// number of the run so far.
     pub fn differences(&self, other: &Config) -> Vec<String> {
         let essence = |config: &Config| {
             let mut config = config.clone();
-            config.run.dir = PathBuf::new();
-            config.run.keep = KEEP;
+            let (log_every, validate_every) = (config.run.log_every, config.run.validate_every);
+            config.run = RunConfig {
+                log_every,
+                validate_every,
+                ..RunConfig::default()
+            };
+            config.train.on_nan = OnNan::default();
             config.data.root = PathBuf::new();
             config.data.layout = String::new();
             config.data.workers = DataConfig::default().workers;

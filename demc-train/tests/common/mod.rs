@@ -9,13 +9,13 @@ pub fn sample() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../data/sample")
 }
 
-/// A run of twelve steps with everything in it that a resume could lose: batch normalisation, augmentation, two
-/// batches a step, a log that is not in step with the checkpoints.
+/// A run of twelve steps with everything in it that a resume could lose: batch normalisation, every augmentation, an
+/// average of the weights, two batches a step, a log that is not in step with the checkpoints.
 pub fn config(dir: &Path) -> PathBuf {
     let text = format!(
         "[model]\nwidth = 2\nreading = \"released\"\n\
          [data]\nroot = {:?}\npatch_size = 64\nbatch_size = 2\nvalidation = 0.2\naugment = true\n\
-         [train]\nsteps = 12\nlr_start = 1e-3\ngrad_accumulation = 2\ngrad_clip = 1.0\n\
+         [train]\nsteps = 12\nema = 0.9\nlr_start = 1e-3\ngrad_accumulation = 2\ngrad_clip = 1.0\n\
          [run]\nlog_every = 2\nvalidate_every = 4\ncheckpoint_every = 3\nkeep = 2\n",
         sample()
     );

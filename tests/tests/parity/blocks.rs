@@ -6,7 +6,8 @@ use std::collections::BTreeMap;
 
 use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
-use demc_model::metrics::{LOSS_EPSILON, loss};
+use demc_model::Loss;
+use demc_model::metrics::LOSS_EPSILON;
 use demc_model::ops::{self, Activation, Maps};
 use demc_model::{Denoiser, Reading, Variant};
 
@@ -83,13 +84,9 @@ fn loss_and_its_gradient_are_pytorchs_at_black_pixels_too() {
     let device = crate::device().autodiff();
     let output = fixture.tensor("loss/output_gamma", &device).require_grad();
     let reference = fixture.tensor("loss/reference_hdr", &device);
-    let loss = loss(
-        ops::process_default(),
-        output.clone(),
-        reference,
-        2.2,
-        LOSS_EPSILON,
-    );
+    let ops = ops::process_default();
+    let losses = Loss::RelMse.per_image(ops, output.clone(), reference, 2.2, LOSS_EPSILON);
+    let loss = losses.mean();
     assert_close(
         "loss",
         &host(loss.clone()),

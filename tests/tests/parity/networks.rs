@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 
 use burn::optim::{AdamConfig, GradientsParams};
 use burn::tensor::{Device, Tensor};
-use demc_model::metrics::{LOSS_EPSILON, loss};
+use demc_model::Loss;
+use demc_model::metrics::LOSS_EPSILON;
 use demc_model::{Denoiser, Ops, Reading, Variant, ops};
 
 use crate::fixture::{
@@ -69,7 +70,8 @@ impl Batch {
 
     fn loss(&self, ops: Ops, output: Tensor<4>) -> Tensor<1> {
         let reference_hdr = self.reference_hdr.clone();
-        loss(ops, output, reference_hdr, 2.2, LOSS_EPSILON)
+        let losses = Loss::RelMse.per_image(ops, output, reference_hdr, 2.2, LOSS_EPSILON);
+        losses.mean()
     }
 }
 
@@ -101,6 +103,16 @@ fn semc_in_the_papers_reading_is_pytorchs() {
 #[test]
 fn semc_in_the_released_reading_is_pytorchs() {
     check(Variant::Semc, Reading::Released);
+}
+
+#[test]
+fn color_only_in_the_papers_reading_is_pytorchs() {
+    check(Variant::ColorOnly, Reading::Paper);
+}
+
+#[test]
+fn color_only_in_the_released_reading_is_pytorchs() {
+    check(Variant::ColorOnly, Reading::Released);
 }
 
 fn check(variant: Variant, reading: Reading) {

@@ -157,7 +157,8 @@ impl KernelOps for Flex {
     }
 }
 
-/// The loss, `[1]`; its gradient by the output into `dout` where asked. Both tensors are [`contiguous`], `[B, C, H, W]`.
+/// The loss of each image, `[B]`; their gradients by the output into `dout` where asked. Both tensors are
+/// [`contiguous`], `[B, C, H, W]`.
 pub(super) fn rel_mse_into(
     out_gamma: &FlexTensor,
     ref_hdr: &FlexTensor,
@@ -165,17 +166,25 @@ pub(super) fn rel_mse_into(
     epsilon: f32,
     dout: Option<&mut [f32]>,
 ) -> FlexTensor {
-    let [batch, _, height, width] = dims(out_gamma);
-    let loss = rel_mse::loss(
-        Isa::current(),
-        values(out_gamma),
-        values(ref_hdr),
-        batch * height * width,
-        gamma,
-        epsilon,
-        dout,
-    );
-    tensor(vec![loss as f32], [1])
+    let [batch, channels, height, width] = dims(out_gamma);
+    let image = channels * height * width;
+    let images = values(out_gamma)
+        .chunks(image)
+        .zip(values(ref_hdr).chunks(image));
+    let loss = |out: &[f32], reference: &[f32], dout: Option<&mut [f32]>| {
+        let pixels = height * width;
+        rel_mse::loss(Isa::current(), out, reference, pixels, gamma, epsilon, dout) as f32
+    };
+    let losses: Vec<f32> = match dout {
+        Some(dout) => images
+            .zip(dout.chunks_mut(image))
+            .map(|((out, reference), dout)| loss(out, reference, Some(dout)))
+            .collect(),
+        None => images
+            .map(|(out, reference)| loss(out, reference, None))
+            .collect(),
+    };
+    tensor(losses, [batch])
 }
 
 pub(super) fn fuse<const P: usize>(

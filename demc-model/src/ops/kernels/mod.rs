@@ -72,7 +72,7 @@ pub(super) trait KernelOps: Backend {
         epsilon: f32,
         relu: bool,
     ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
-    /// Eq. 5, `[1]`; the reference has no gradient.
+    /// Eq. 5 of each image, `[B]`; the reference has no gradient.
     fn rel_mse_of_gamma(
         out_gamma: FloatTensor<Self>,
         ref_hdr: FloatTensor<Self>,

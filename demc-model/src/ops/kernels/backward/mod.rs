@@ -9,7 +9,6 @@ use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::Checkpoi
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, NodeGuard, Ops, OpsKind};
 use burn::backend::flex::FlexTensor;
-use burn::backend::ops::FloatTensorOps;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, AutodiffBackend, Flex};
 use demc_kernels::{Isa, batch_norm, pool};
@@ -269,15 +268,21 @@ impl Backward<Flex, 1> for Relayout {
 struct RelMse;
 
 impl Backward<Flex, 1> for RelMse {
-    /// The loss's gradient by the output.
+    /// Each image's loss's gradient by its output, `[B, C, H, W]`.
     type State = FlexTensor;
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
         let dloss = contiguous(grads.consume::<Flex>(&ops.node));
         let ([node], dout) = (ops.parents, ops.state);
         if let Some(node) = node {
-            let factor = values(&dloss)[0];
-            grads.register::<Flex>(node.id, Flex::float_mul_scalar(dout, factor.into()));
+            let mut dout = dout;
+            let factors = values(&dloss);
+            let image = values(&dout).len() / factors.len();
+            let images = dout.storage_mut::<f32>().chunks_mut(image);
+            for (dout, factor) in images.zip(factors) {
+                dout.iter_mut().for_each(|value| *value *= factor);
+            }
+            grads.register::<Flex>(node.id, dout);
         }
     }
 }

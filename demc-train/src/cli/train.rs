@@ -1,25 +1,21 @@
-//! The command line: flags to a resolved configuration, and what is printed around a run.
+//! Training: flags to a resolved configuration, and what is printed around a run.
 
 use std::path::PathBuf;
+use std::process::ExitCode;
 
-use clap::Parser;
+use clap::Args;
 use demc_infer::compute::{self, ComputeFlags};
 use demc_infer::device;
-use demc_train::checkpoint;
+use demc_train::checkpoint::{self, Checkpoint, Found, Store};
 use demc_train::config::Config;
 use demc_train::data::Data;
 use demc_train::estimate::Estimate;
 use demc_train::progress::say;
 use demc_train::run_dir::RunDir;
-use demc_train::train::Run;
+use demc_train::signals;
+use demc_train::train::{Ended, Run};
 
-/// Train a DEMC Monte Carlo denoiser on rendered images.
-///
-/// The configuration is a TOML file with the tables [model], [data], [train] and [run]; configs/demc.toml names every
-/// key. The run directory keeps the resolved configuration, metrics.jsonl, checkpoints, the best weights and pictures;
-/// `demc-infer --model RUN_DIR` uses it as it is.
-#[derive(Debug, Parser)]
-#[command(version, after_help = EXAMPLES)]
+#[derive(Debug, Args)]
 pub struct Arguments {
     /// Configuration of the run
     #[arg(short, long, value_name = "FILE")]
@@ -49,14 +45,8 @@ pub struct Arguments {
     check: bool,
 }
 
-const EXAMPLES: &str = "\
-Examples:
-  demc-train --config configs/quickstart.toml
-  demc-train --config configs/demc.toml --set data.root=/renders --run-dir runs/mine --device cuda
-  demc-train --config configs/demc.toml --run-dir runs/mine --resume";
-
-/// Runs the program.
-pub fn run(arguments: Arguments) -> anyhow::Result<()> {
+/// Trains, or goes on.
+pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let mut sets = arguments.set;
     if let Some(dir) = &arguments.run_dir {
         sets.push(format!(
@@ -66,21 +56,20 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
     }
     let config = Config::load(&arguments.config, &sets)?;
     arguments.compute.apply()?;
-    let dir = RunDir::claim(&config, arguments.resume)?;
+    let mut dir = RunDir::claim(&config, arguments.resume)?;
+    if !arguments.check {
+        dir.lock_if_there()?;
+    }
     let device = device::parse(&arguments.device)?;
     let data = Data::open(&config.data, config.train.seed)?;
+    let mut notes = Vec::new();
     let checkpoint = match arguments.resume {
-        true => checkpoint::load_latest(
-            dir.path(),
-            config.train.adam_epsilon,
-            &device.clone().autodiff(),
-        )?,
+        true => latest(&config, &dir, !arguments.check, &device, &mut notes)?,
         false => None,
     };
     let first = checkpoint
         .as_ref()
         .map_or(0, |checkpoint| checkpoint.state.step);
-    let nothing = arguments.resume && checkpoint.is_none();
     let estimate = Estimate::measure(&config, &data, first, &device.clone().autodiff());
     let run_path = dir.path().to_owned();
     say(format!(
@@ -101,11 +90,8 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
             data.clamped
         ));
     }
-    if nothing {
-        say(format!(
-            "note: no checkpoint in {}: starting at step 0",
-            dir.path().display()
-        ));
+    for note in notes {
+        say(format!("note: {note}"));
     }
     let mut run = Run::new(config, data, dir, checkpoint, &device)?;
     say(format!(
@@ -119,10 +105,16 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
     ));
     if arguments.check {
         say("check: all is well; nothing was written");
-        return Ok(());
+        return Ok(ExitCode::SUCCESS);
     }
     say(format!("run: {}\n", run_path.display()));
-    run.train(&arguments.device)?;
+    if let Ended::Stopped { signal, step } = run.train(&arguments.device)? {
+        say(format!(
+            "\n{}: stopped after step {step}, everything is saved; --resume goes on from there",
+            signals::name(signal)
+        ));
+        return Ok(ExitCode::from(signals::exit_code(signal) as u8));
+    }
     match run.test(&device)? {
         Some((step, report)) => say(format!("\nTest split, weights of step {step}:\n\n{report}")),
         None => say("\nThe data set has no test split: nothing to score."),
@@ -131,5 +123,36 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         "\nweights, pictures and scores: {}",
         run_path.display()
     ));
-    Ok(())
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The checkpoint to go on from, the run directory brought to where it left off if it may be `written`; what the user should
+/// know goes to `notes`.
+fn latest(
+    config: &Config,
+    dir: &RunDir,
+    written: bool,
+    device: &burn::tensor::Device,
+    notes: &mut Vec<String>,
+) -> anyhow::Result<Option<Checkpoint>> {
+    let Found { intact, damaged } = Store::new(dir.path()).newest_intact()?;
+    let Some(intact) = intact else {
+        anyhow::ensure!(
+            damaged.is_empty(),
+            "{}: no checkpoint is whole: {}",
+            dir.path().display(),
+            damaged.join("; ")
+        );
+        let path = dir.path().display();
+        notes.push(format!("no checkpoint in {path}: starting at step 0"));
+        return Ok(None);
+    };
+    notes.extend(damaged);
+    let device = device.clone().autodiff();
+    let checkpoint = checkpoint::load(&intact, config.train.adam_epsilon, &device)?;
+    notes.push(format!("going on from {}", intact.display()));
+    if written {
+        notes.extend(checkpoint::restore_run(dir.path(), &intact)?);
+    }
+    Ok(Some(checkpoint))
 }
