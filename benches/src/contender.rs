@@ -31,7 +31,7 @@ impl Training {
         let model = moved(&bundle.model, &device);
         let adam = Adam::new(config.train.adam_epsilon);
         Training {
-            trainer: Trainer::new(&config, model, adam, device),
+            trainer: Trainer::new(&config, model, adam, None, device),
             input,
             lr,
         }

@@ -47,6 +47,8 @@ fn batches_are_the_same_for_any_number_of_workers() {
         augment: Augment {
             flip: true,
             transpose: true,
+            rgb: true,
+            exposure: true,
         },
         ..small()
     };
@@ -125,7 +127,7 @@ fn augmentation_turns_all_buffers_of_a_patch_alike() {
     let turned = source(&DataConfig {
         augment: Augment {
             flip: true,
-            transpose: false,
+            ..Augment::default()
         },
         ..small()
     });
@@ -151,6 +153,66 @@ fn augmentation_turns_all_buffers_of_a_patch_alike() {
         corners.len() > 1,
         "seven patches, four orientations: {corners:?}"
     );
+}
+
+/// Colour, both textures and reference by one order and colour and reference by one factor; normals and positions stay.
+#[test]
+fn rgb_and_exposure_change_what_they_should_alike() {
+    let plain = source(&small()).batch(0).expect("the sample is sound");
+    let varied = source(&DataConfig {
+        augment: Augment {
+            rgb: true,
+            exposure: true,
+            ..Augment::default()
+        },
+        ..small()
+    });
+    let varied = varied.batch(0).expect("the sample is sound");
+    let pixels = 64 * 64;
+    let mut orders = HashSet::new();
+    for b in 0..plain.size {
+        let planes = |values: &[f32], channels: usize, first: usize, count: usize| {
+            let from = (b * channels + first) * pixels;
+            values[from..from + count * pixels].to_vec()
+        };
+        let images = |batch: &Batch| {
+            let textures = [6, 9].map(|first| planes(&batch.features_z, FEATURES, first, 3));
+            (planes(&batch.reference_hdr, 3, 0, 3), textures)
+        };
+        let geometry = |batch: &Batch| planes(&batch.features_z, FEATURES, 0, 6);
+        assert_eq!(geometry(&plain), geometry(&varied));
+        let ((before, textures), (after, varied_textures)) = (images(&plain), images(&varied));
+        let sum = |planes: &[f32]| planes.iter().map(|v| f64::from(*v)).sum::<f64>();
+        let exposure = sum(&after) / sum(&before);
+        assert!((0.5..2.0).contains(&exposure), "{exposure}");
+        // Which plane each of the three comes from.
+        let order: Vec<usize> = after
+            .chunks(pixels)
+            .map(|plane| {
+                let from = before.chunks(pixels).position(|from| {
+                    let mut values = from.iter().zip(plane);
+                    values.all(|(a, b)| {
+                        (f64::from(*a) * exposure - f64::from(*b)).abs() < 1e-4 * f64::from(a + b)
+                    })
+                });
+                from.expect("it comes from one of them")
+            })
+            .collect();
+        for (before, after) in textures.iter().zip(&varied_textures) {
+            for (plane, from) in after.chunks(pixels).zip(&order) {
+                assert_eq!(plane, &before[from * pixels..][..pixels]);
+            }
+        }
+        let gamma = |batch: &Batch, plane: usize| planes(&batch.color_gamma, 3, plane, 1);
+        for (plane, from) in order.iter().enumerate() {
+            for (a, b) in gamma(&plain, *from).iter().zip(gamma(&varied, plane)) {
+                let expected = f64::from(*a) * exposure.powf(1.0 / 2.2);
+                assert!((f64::from(b) - expected).abs() <= 1e-5 * expected + 1e-9);
+            }
+        }
+        orders.insert(order);
+    }
+    assert!(orders.len() > 1, "seven patches, six orders: {orders:?}");
 }
 
 #[test]
