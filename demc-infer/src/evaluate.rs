@@ -8,13 +8,13 @@ use std::fmt;
 
 use demc_data::Frame;
 use demc_model::metrics;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::Bundle;
 use crate::denoise::DenoiseError;
 
 /// How near an image is to its reference.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Score {
     /// Eq. 5: summed over rgb, averaged over pixels, epsilon 0.001, linear HDR. Smaller is better.
     pub relmse: f64,
@@ -45,7 +45,7 @@ impl Score {
 }
 
 /// The scores of one image.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ImageScore {
     /// The image.
     pub name: String,
@@ -98,7 +98,7 @@ pub fn score(
 }
 
 /// The means over a report's images.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MeanScore {
     /// Of the inputs.
     pub noisy: Score,
@@ -110,7 +110,7 @@ pub struct MeanScore {
 
 /// The scores of several images and their mean. [`Display`](fmt::Display) is a Markdown table; the JSON of
 /// `serde` is `{"images": [...], "mean": {...}}`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Report {
     /// One score an image, in the order given.
     pub images: Vec<ImageScore>,

@@ -62,7 +62,7 @@ impl ModelConfig {
 }
 
 impl Denoiser {
-    fn build(
+    pub(crate) fn build(
         b: &mut Builder,
         config: &ModelConfig,
         head_bias: [f32; 3],

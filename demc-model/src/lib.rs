@@ -11,6 +11,7 @@
 //! not known here: see `demc-data`.
 
 pub mod config;
+mod cost;
 pub mod decoder;
 pub mod denoiser;
 pub mod encoder;

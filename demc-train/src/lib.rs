@@ -5,18 +5,23 @@
 //! held-out scenes with the code that ships, [`checkpoint`] and [`run_dir`] keep what a resumed run needs to go on bit
 //! for bit. [`train`] is the loop that ties them together.
 
+pub mod ablation;
+pub mod chart;
 pub mod checkpoint;
 pub mod config;
 pub mod data;
 pub mod ema;
 pub mod estimate;
+pub mod find_lr;
 pub mod metrics_log;
 pub mod optimizer;
+pub mod plot;
 pub mod progress;
 pub mod recorder;
 pub mod run_dir;
 mod running_statistics;
 pub mod schedule;
+pub mod session;
 pub mod signals;
 pub mod tensorboard;
 pub mod train;

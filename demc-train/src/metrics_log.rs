@@ -126,6 +126,14 @@ impl Metrics {
     }
 }
 
+/// Seconds that the run of a log took; `None` where no line tells.
+pub fn elapsed(path: &Path) -> Option<f64> {
+    let text = fs::read_to_string(path).ok()?;
+    let mut lines = text.lines().rev();
+    let line = lines.find_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())?;
+    line.get("elapsed_s")?.as_f64()
+}
+
 /// Whether `text` is a whole line of a step up to `step`.
 fn is_line_until(text: &str, step: u64) -> bool {
     let line = text

@@ -65,7 +65,7 @@ struct Record {
     #[serde(default)]
     operations: String,
     /// Trainable values of the network.
-    parameters: usize,
+    parameters: u64,
     /// Patches of an epoch.
     patches: usize,
     /// Names of the scenes of each split.
@@ -118,7 +118,7 @@ pub struct Facts<'a> {
     /// The operations that run there, and on which instructions.
     pub operations: &'a str,
     /// Trainable values of the network.
-    pub parameters: usize,
+    pub parameters: u64,
     /// Patches of an epoch.
     pub patches: usize,
 }

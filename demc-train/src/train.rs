@@ -122,6 +122,11 @@ impl Run {
         })
     }
 
+    /// What the run is.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
     /// Patches that one step sees.
     pub fn patches_per_step(&self) -> u64 {
         self.config.patches_per_step()
@@ -133,8 +138,8 @@ impl Run {
     }
 
     /// Trainable values of the network.
-    pub fn parameters(&self) -> usize {
-        self.trainer.model().parameter_count()
+    pub fn parameters(&self) -> u64 {
+        self.config.model.parameter_count()
     }
 
     /// Trains to the last step or the first signal, recording on the way; `device` is the device's name, for the record.

@@ -162,6 +162,15 @@ impl Trainer {
         Ok(step)
     }
 
+    /// The mean loss of some batches; no step is taken.
+    pub fn mean_loss(&self, batches: &[Batch]) -> f64 {
+        let losses = batches.iter().map(|batch| {
+            let mean = self.losses(batch).mean();
+            f64::from(mean.into_scalar::<f32>())
+        });
+        losses.sum::<f64>() / batches.len() as f64
+    }
+
     /// Clips the gradient of norm `norm`, and moves weights and average.
     fn descend(&mut self, lr: f64, mut grads: GradientsParams, norm: f64) {
         let limit = f64::from(self.config.grad_clip);

@@ -7,24 +7,7 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use common::{command, config, error_line, stderr, train};
-
-/// `metrics.jsonl` without what depends on the clock.
-fn metrics(run: &Path) -> Vec<serde_json::Value> {
-    let text = fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
-    let lines = text
-        .lines()
-        .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
-    lines
-        .map(|mut line| {
-            for key in ["elapsed_s", "patches_per_s"] {
-                let line = line.as_object_mut().expect("an object");
-                line.remove(key).expect("a time");
-            }
-            line
-        })
-        .collect()
-}
+use common::{assert_same_run, command, config, error_line, metrics, stderr, train};
 
 /// Starts the run, kills it (SIGKILL) once its log has `lines` lines, and says whether it was still running.
 fn kill_after(config: &Path, run: &Path, args: &[&str], lines: usize) -> bool {
@@ -63,17 +46,7 @@ fn killed_and_resumed_equals_undisturbed() {
     let output = train(&config, &broken, &["--resume"]);
     assert!(output.status.success(), "{}", stderr(&output));
 
-    assert_eq!(metrics(&broken), metrics(&whole));
-    for file in [
-        "best.safetensors",
-        "checkpoints/step-00000012/model.safetensors",
-        "checkpoints/step-00000012/average.safetensors",
-        "checkpoints/step-00000012/optimizer.safetensors",
-        "test.json",
-    ] {
-        let bytes = |run: &Path| fs::read(run.join(file)).expect(file);
-        assert!(bytes(&whole) == bytes(&broken), "{file} differs");
-    }
+    assert_same_run(&whole, &broken, "killed three times");
     let kept = fs::read_dir(broken.join("checkpoints"))
         .expect("checkpoints")
         .count();

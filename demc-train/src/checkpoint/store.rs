@@ -92,6 +92,11 @@ impl Store {
         })
     }
 
+    /// Whether there is a checkpoint of this step, whole or not.
+    pub fn has(&self, step: u64) -> bool {
+        self.all().join(format!("step-{step:08}")).is_dir()
+    }
+
     /// The checkpoint that `latest` names, or else the newest that is whole.
     ///
     /// # Errors

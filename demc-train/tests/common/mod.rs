@@ -56,3 +56,38 @@ pub fn error_line(output: &Output, code: i32) -> String {
     assert!(text.starts_with("error: "), "{text}");
     text
 }
+
+/// `metrics.jsonl` without what depends on the clock.
+pub fn metrics(run: &Path) -> Vec<serde_json::Value> {
+    let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
+    let lines = text
+        .lines()
+        .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
+    lines
+        .map(|mut line| {
+            for key in ["elapsed_s", "patches_per_s"] {
+                let line = line.as_object_mut().expect("an object");
+                line.remove(key).expect("a time");
+            }
+            line
+        })
+        .collect()
+}
+
+/// The files of a finished run of [`config`] that must not depend on what happened to it on the way.
+pub const RESULTS: [&str; 5] = [
+    "best.safetensors",
+    "checkpoints/step-00000012/model.safetensors",
+    "checkpoints/step-00000012/average.safetensors",
+    "checkpoints/step-00000012/optimizer.safetensors",
+    "test.json",
+];
+
+/// Fails unless two finished runs of [`config`] ended alike, log included.
+pub fn assert_same_run(whole: &Path, other: &Path, what: &str) {
+    assert_eq!(metrics(other), metrics(whole), "{what}");
+    for file in RESULTS {
+        let bytes = |run: &Path| std::fs::read(run.join(file)).expect(file);
+        assert!(bytes(whole) == bytes(other), "{what}: {file} differs");
+    }
+}

@@ -1,0 +1,170 @@
+//! Means and paired differences with bootstrap intervals (Efron 1979) over images and seeds.
+//!
+//! A table of scores has a row a seed and a column an image. A resample draws seeds and images, each with replacement and
+//! independently, and takes the mean of the cells where they cross; the interval is that between the 2.5 % and 97.5 %
+//! quantiles of such means. Comparisons are paired: the cells are differences of two variants on the same image, trained
+//! from the same seed on the same batches.
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+/// Resamples of an interval; ours.
+pub const RESAMPLES: usize = 10_000;
+/// Share of the resampled means outside of an interval.
+const OUTSIDE: f64 = 0.05;
+/// Seed of the resampling, so that a table is the same every time.
+const SEED: u64 = 1;
+
+/// A mean and its 95 % interval.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Estimate {
+    /// Of all cells.
+    pub mean: f64,
+    /// Lower and upper end of the interval.
+    pub interval: [f64; 2],
+}
+
+impl Estimate {
+    /// The mean of `scores[seed][image]` with its interval; `None` for an empty table.
+    ///
+    /// # Panics
+    /// Where the rows are not of one length.
+    pub fn of(scores: &[Vec<f64>]) -> Option<Self> {
+        let (seeds, images) = (scores.len(), scores.first()?.len());
+        if images == 0 {
+            return None;
+        }
+        assert!(scores.iter().all(|row| row.len() == images), "a full table");
+        let mean = |rows: &[usize], columns: &[usize]| {
+            let cells = rows
+                .iter()
+                .flat_map(|row| columns.iter().map(|c| scores[*row][*c]));
+            cells.sum::<f64>() / (rows.len() * columns.len()) as f64
+        };
+        let mut rng = ChaCha8Rng::seed_from_u64(SEED);
+        let mut draw = |count: usize| -> Vec<usize> {
+            (0..count).map(|_| rng.random_range(0..count)).collect()
+        };
+        let mut means: Vec<f64> = (0..RESAMPLES)
+            .map(|_| mean(&draw(seeds), &draw(images)))
+            .collect();
+        means.sort_by(f64::total_cmp);
+        let all = |count: usize| (0..count).collect::<Vec<_>>();
+        Some(Estimate {
+            mean: mean(&all(seeds), &all(images)),
+            interval: [OUTSIDE / 2.0, 1.0 - OUTSIDE / 2.0].map(|share| quantile(&means, share)),
+        })
+    }
+
+    /// The paired difference `a - b`; `None` for empty tables.
+    ///
+    /// # Panics
+    /// Where the tables are not of one size.
+    pub fn of_difference(a: &[Vec<f64>], b: &[Vec<f64>]) -> Option<Self> {
+        assert_eq!(a.len(), b.len(), "tables of the same seeds");
+        let rows = a.iter().zip(b).map(|(a, b)| {
+            assert_eq!(a.len(), b.len(), "tables of the same images");
+            a.iter().zip(b).map(|(a, b)| a - b).collect()
+        });
+        Self::of(&rows.collect::<Vec<_>>())
+    }
+
+    /// Whether zero lies outside of the interval.
+    pub fn is_significant(&self) -> bool {
+        self.interval[0] > 0.0 || self.interval[1] < 0.0
+    }
+}
+
+/// A quantile of sorted values, between two of them where it falls there.
+fn quantile(sorted: &[f64], share: f64) -> f64 {
+    let place = share * (sorted.len() - 1) as f64;
+    let (below, rest) = (place.floor() as usize, place.fract());
+    let above = (below + 1).min(sorted.len() - 1);
+    sorted[below] + rest * (sorted[above] - sorted[below])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn normal(rng: &mut ChaCha8Rng) -> f64 {
+        // The sum of 12 uniform numbers has variance 1.
+        (0..12).map(|_| rng.random::<f64>()).sum::<f64>() - 6.0
+    }
+
+    #[test]
+    fn quantiles_of_a_ramp_are_its_places() {
+        let ramp: Vec<f64> = (0..=100).map(f64::from).collect();
+        assert_eq!(quantile(&ramp, 0.025), 2.5);
+        assert_eq!(quantile(&ramp, 1.0), 100.0);
+    }
+
+    #[test]
+    fn equal_scores_have_no_width_and_no_table_no_mean() {
+        let equal = vec![vec![0.25; 3]; 2];
+        let found = Estimate::of(&equal).unwrap();
+        assert_eq!((found.mean, found.interval), (0.25, [0.25; 2]));
+        let difference = Estimate::of_difference(&equal, &equal).unwrap();
+        assert!(!difference.is_significant());
+        assert_eq!(Estimate::of(&[]), None);
+        assert_eq!(Estimate::of(&[vec![]]), None);
+    }
+
+    /// Of one seed, the interval is that of the mean of n values: 1.96 deviations by sqrt(n) on both sides.
+    #[test]
+    fn interval_of_one_seed_is_that_of_the_central_limit() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let scores: Vec<f64> = (0..100).map(|_| 3.0 + normal(&mut rng)).collect();
+        let mean = scores.iter().sum::<f64>() / 100.0;
+        let variance = scores.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / 100.0;
+        let half = 1.96 * (variance / 100.0).sqrt();
+        let found = Estimate::of(&[scores]).unwrap();
+        assert!((found.mean - mean).abs() < 1e-12);
+        let [low, high] = found.interval;
+        assert!(
+            ((mean - low) / half - 1.0).abs() < 0.06,
+            "{found:?}, half {half}"
+        );
+        assert!(
+            ((high - mean) / half - 1.0).abs() < 0.06,
+            "{found:?}, half {half}"
+        );
+    }
+
+    /// Two variants that differ from image to image far more than from each other: only pairing sees the difference.
+    #[test]
+    fn pairing_finds_a_small_difference_between_widely_different_images() {
+        let mut rng = ChaCha8Rng::seed_from_u64(6);
+        let a: Vec<f64> = (0..20).map(|_| 10.0 * normal(&mut rng)).collect();
+        let b: Vec<f64> = a
+            .iter()
+            .map(|x| x + 0.1 + 0.05 * normal(&mut rng))
+            .collect();
+        let found = Estimate::of_difference(&[b.clone()], &[a.clone()]).unwrap();
+        assert!(
+            found.is_significant() && (found.mean - 0.1).abs() < 0.05,
+            "{found:?}"
+        );
+        let [a, b] = [a, b].map(|row| Estimate::of(&[row]).unwrap());
+        assert!(a.interval[1] > b.interval[0], "unpaired they overlap");
+    }
+
+    /// What seeds do to all images at once widens the interval, however many images there are.
+    #[test]
+    fn seeds_that_disagree_widen_the_interval() {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let table = |rng: &mut ChaCha8Rng, effects: [f64; 3]| -> Vec<Vec<f64>> {
+            let row = |effect: f64, rng: &mut ChaCha8Rng| {
+                (0..50).map(|_| effect + 0.1 * normal(rng)).collect()
+            };
+            effects.map(|effect| row(effect, rng)).to_vec()
+        };
+        let agree = Estimate::of(&table(&mut rng, [1.0, 1.0, 1.0])).unwrap();
+        let disagree = Estimate::of(&table(&mut rng, [-1.0, 0.5, 2.0])).unwrap();
+        assert!(
+            agree.is_significant() && !disagree.is_significant(),
+            "{disagree:?}"
+        );
+    }
+}

@@ -1,0 +1,299 @@
+//! A comparison as Markdown, CSV, JSON and a figure (as the paper's Fig. 10).
+
+use std::fmt::Write as _;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use demc_data::file::write_whole;
+
+use super::statistics::{Estimate, RESAMPLES};
+use super::{Comparison, Row};
+use crate::chart::{Bar, BarPanel, Figure, Scale};
+
+/// Name of all files, without ending.
+const STEM: &str = "ablation";
+/// Pixels that operations are told for.
+const MEGAPIXEL: f64 = 1e6;
+/// Operations of a GFLOP.
+const GIGA: f64 = 1e9;
+
+/// Writes all five files into `dir`.
+pub(super) fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    std::fs::create_dir_all(dir).with_context(|| dir.display().to_string())?;
+    let texts = [
+        ("md", markdown(comparison)),
+        ("csv", csv(comparison)),
+        ("json", serde_json::to_string_pretty(comparison)?),
+    ];
+    let mut paths = Vec::new();
+    for (ending, text) in texts {
+        let path = dir.join(format!("{STEM}.{ending}"));
+        write_whole(&path, |file| file.write_all(text.as_bytes()))?;
+        paths.push(path);
+    }
+    paths.extend(figure(comparison).write(&dir.join(STEM))?);
+    Ok(paths)
+}
+
+/// The table, what it says, and how to read it.
+pub(super) fn markdown(comparison: &Comparison) -> String {
+    let Comparison {
+        seeds,
+        images,
+        rows,
+        differences,
+    } = comparison;
+    let first = rows.first().map_or("", |row| &row.name);
+    let mut text = format!(
+        "| variant | C | parameters | GFLOP / Mpx | training, min | RelMSE | - {first} | SSIM | - {first} |\n\
+         |---|---:|---:|---:|---:|---:|---:|---:|---:|\n"
+    );
+    for row in rows {
+        let _ = writeln!(
+            text,
+            "| {} | {} | {}{} | {:.0} | {:.1} | {} | {} | {} | {} |",
+            row.name,
+            row.width,
+            row.parameters,
+            excess(row, &rows[0]),
+            row.flops_per_pixel * MEGAPIXEL / GIGA,
+            row.seconds / 60.0,
+            mean(Some(row.relmse)),
+            difference(row.relmse_difference),
+            mean(row.ssim),
+            difference(row.ssim_difference),
+        );
+    }
+    let _ = writeln!(
+        text,
+        "\nMeans over {} test images and {} ({}) with 95 % bootstrap intervals over images and seeds ({RESAMPLES} resamples); \
+         differences are paired by image and seed, and in bold where their interval leaves out 0. RelMSE: Eq. 5, summed over \
+         rgb, linear HDR, smaller is better. SSIM: Wang et al. 2004 on clip(x, 0, 1)^(1/2.2), larger is better.\n",
+        images.len(),
+        count(seeds.len(), "seed"),
+        seeds
+            .iter()
+            .map(ToString::to_string)
+            .collect::<Vec<_>>()
+            .join(", "),
+    );
+    for verdict in comparison.verdicts() {
+        let _ = writeln!(text, "- {verdict}.");
+    }
+    if seeds.len() == 1 {
+        text.push_str(
+            "- One seed: the intervals know nothing of how much another seed would change.\n",
+        );
+    }
+    match differences.is_empty() {
+        true => text.push_str(
+            "- All variants saw the same batches in the same order for as many steps; they differ in the network alone.\n",
+        ),
+        false => {
+            let _ = writeln!(
+                text,
+                "- **Not only the network differs:** {}.",
+                differences.join("; ")
+            );
+        }
+    }
+    text
+}
+
+/// ` (+0.3 %)` beside the parameters of a variant that has others than the first.
+fn excess(row: &Row, first: &Row) -> String {
+    let excess = row.parameters as f64 / first.parameters as f64 - 1.0;
+    match row.parameters == first.parameters {
+        true => String::new(),
+        false => format!(" ({:+.1} %)", 100.0 * excess),
+    }
+}
+
+fn count(number: usize, what: &str) -> String {
+    format!("{number} {what}{}", if number == 1 { "" } else { "s" })
+}
+
+fn mean(estimate: Option<Estimate>) -> String {
+    estimate.map_or(
+        "-".into(),
+        |Estimate {
+             mean,
+             interval: [low, high],
+         }| { format!("{mean:.4} ({low:.4} to {high:.4})") },
+    )
+}
+
+fn difference(estimate: Option<Estimate>) -> String {
+    let Some(found) = estimate else {
+        return "-".into();
+    };
+    let [low, high] = found.interval;
+    let text = format!("{:+.4}", found.mean);
+    let text = if found.is_significant() {
+        format!("**{text}**")
+    } else {
+        text
+    };
+    format!("{text} ({low:+.4} to {high:+.4})")
+}
+
+/// A row a variant, plain numbers.
+fn csv(comparison: &Comparison) -> String {
+    let estimate = |found: Option<Estimate>| match found {
+        Some(Estimate {
+            mean,
+            interval: [low, high],
+        }) => format!("{mean},{low},{high}"),
+        None => ",,".into(),
+    };
+    let heads = ["relmse", "relmse_difference", "ssim", "ssim_difference"]
+        .map(|name| format!("{name},{name}_low,{name}_high"));
+    let mut text = format!(
+        "variant,width,parameters,flops_per_pixel,seconds,{}\n",
+        heads.join(",")
+    );
+    for row in &comparison.rows {
+        let estimates = [
+            Some(row.relmse),
+            row.relmse_difference,
+            row.ssim,
+            row.ssim_difference,
+        ];
+        let _ = writeln!(
+            text,
+            "{},{},{},{},{},{}",
+            row.name,
+            row.width,
+            row.parameters,
+            row.flops_per_pixel,
+            row.seconds,
+            estimates.map(estimate).join(",")
+        );
+    }
+    text
+}
+
+/// RelMSE and SSIM, and the paired differences; a dot a seed.
+fn figure(comparison: &Comparison) -> Figure {
+    let bar = |estimate: Estimate, points: &[f64]| Bar {
+        value: estimate.mean,
+        interval: Some((estimate.interval[0], estimate.interval[1])),
+        points: points.to_vec(),
+    };
+    let panel = |title: &str, label: &str, bars: Vec<(String, Bar)>| {
+        let (names, bars) = bars.into_iter().unzip();
+        BarPanel {
+            title: title.into(),
+            y_label: label.into(),
+            names,
+            bars,
+            y: Scale::Linear,
+        }
+    };
+    let rows = comparison.rows.iter();
+    let relmse = rows
+        .clone()
+        .map(|row| (row.name.clone(), bar(row.relmse, &row.relmse_of_seeds)));
+    let ssim = rows.filter_map(|row| Some((row.name.clone(), bar(row.ssim?, &row.ssim_of_seeds))));
+    let mut panels = vec![panel(
+        "RelMSE of the test split (lower is better)",
+        "RelMSE",
+        relmse.collect(),
+    )];
+    let ssim: Vec<_> = ssim.collect();
+    if !ssim.is_empty() {
+        panels.push(panel(
+            "SSIM of the test split (higher is better)",
+            "SSIM",
+            ssim,
+        ));
+    }
+    Figure::Bars(panels)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(name: &str, parameters: u64, difference: Option<Estimate>) -> Row {
+        let estimate = |mean: f64| Estimate {
+            mean,
+            interval: [mean - 0.01, mean + 0.01],
+        };
+        Row {
+            name: name.into(),
+            width: 16,
+            parameters,
+            flops_per_pixel: 125_000.0,
+            seconds: 90.0,
+            relmse: estimate(0.2),
+            ssim: Some(estimate(0.7)),
+            relmse_difference: difference,
+            ssim_difference: difference.map(|_| estimate(0.001)),
+            relmse_of_seeds: vec![0.19, 0.21],
+            ssim_of_seeds: vec![0.7, 0.7],
+        }
+    }
+
+    fn comparison() -> Comparison {
+        let worse = Estimate {
+            mean: 0.05,
+            interval: [0.02, 0.08],
+        };
+        Comparison {
+            seeds: vec![1, 2],
+            images: vec!["a".into(), "b".into(), "c".into()],
+            rows: vec![row("DEMC", 1000, None), row("SEMC", 1010, Some(worse))],
+            differences: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn table_says_what_is_significant_and_what_is_not() {
+        let text = markdown(&comparison());
+        for words in [
+            "| DEMC | 16 | 1000 | 125 | 1.5 | 0.2000 (0.1900 to 0.2100) | - |",
+            "| SEMC | 16 | 1010 (+1.0 %) |",
+            "**+0.0500** (+0.0200 to +0.0800)",
+            "| +0.0010 (-0.0090 to +0.0110) |",
+            "3 test images and 2 seeds (1, 2)",
+            "- SEMC against DEMC: worse in RelMSE (+0.0500, 95 % +0.0200 to +0.0800); no significant difference in SSIM",
+            "All variants saw the same batches",
+        ] {
+            assert!(text.contains(words), "{words}:\n{text}");
+        }
+    }
+
+    #[test]
+    fn one_seed_and_other_batches_are_said() {
+        let mut comparison = comparison();
+        comparison.seeds = vec![1];
+        comparison.differences = vec!["SEMC: train.steps = 3, there 4".into()];
+        let text = markdown(&comparison);
+        assert!(
+            text.contains("1 seed (1)") && text.contains("One seed:"),
+            "{text}"
+        );
+        assert!(
+            text.contains("Not only the network differs:** SEMC: train.steps = 3"),
+            "{text}"
+        );
+    }
+
+    #[test]
+    fn csv_has_as_many_cells_in_every_row() {
+        let text = csv(&comparison());
+        let cells: Vec<usize> = text.lines().map(|line| line.split(',').count()).collect();
+        assert_eq!(cells, [17, 17, 17]);
+    }
+
+    #[test]
+    fn json_comes_back() {
+        let text = serde_json::to_string(&comparison()).unwrap();
+        assert_eq!(
+            serde_json::from_str::<Comparison>(&text).unwrap(),
+            comparison()
+        );
+    }
+}

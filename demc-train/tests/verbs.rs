@@ -1,0 +1,209 @@
+//! The verbs beside training: find-lr, ablate, plot, by the real binary.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use common::{config, error_line, metrics, stderr, train};
+
+fn run(args: &[&str]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_demc-train"));
+    command.args(args).output().expect("the binary runs")
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().expect("UTF-8")
+}
+
+fn stdout(output: &Output) -> String {
+    assert!(output.status.success(), "{}", stderr(output));
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+/// An ablation of three small networks, two seeds each, of four steps.
+fn ablation(dir: &Path) -> std::path::PathBuf {
+    let base = config(dir);
+    let path = dir.join("ablation.toml");
+    let text = format!(
+        "base = {base:?}\ndir = {:?}\nseeds = [1, 2]\n\
+         set = [\"train.steps=4\", \"model.width=4\", \"model.reading=paper\", \"run.checkpoint_every=1\"]\n\
+         [[variants]]\nname = \"DEMC\"\n\
+         [[variants]]\nname = \"SEMC\"\nset = [\"model.variant=semc\"]\n\
+         [[variants]]\nname = \"color-only\"\nset = [\"model.variant=color-only\"]\n",
+        dir.join("ablation")
+    );
+    fs::write(&path, text).expect("a file");
+    path
+}
+
+fn finished_runs(dir: &Path) -> usize {
+    let runs = fs::read_dir(dir).into_iter().flatten().flatten();
+    runs.filter(|run| run.path().join("test.json").exists())
+        .count()
+}
+
+#[test]
+fn an_ablation_goes_on_where_it_stopped_and_ends_with_table_and_figure() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let spec = ablation(dir.path());
+    let out = dir.path().join("ablation");
+    let args = ["ablate", "--config", text(&spec)];
+
+    let mut first = Command::new(env!("CARGO_BIN_EXE_demc-train"))
+        .args(args)
+        .stdout(Stdio::null())
+        .spawn()
+        .expect("the binary runs");
+    let started = Instant::now();
+    while finished_runs(&out) < 2 {
+        assert!(started.elapsed() < Duration::from_secs(300), "no progress");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    first.kill().expect("a child");
+    first.wait().expect("a child");
+    let before = fs::read(out.join("DEMC-seed-1/metrics.jsonl")).expect("a log");
+
+    let said = stdout(&run(&args));
+    assert!(said.contains("DEMC, seed 1 (1 of 6): complete"), "{said}");
+    let after = fs::read(out.join("DEMC-seed-1/metrics.jsonl")).expect("a log");
+    assert_eq!(before, after, "a complete run is not trained again");
+    assert_eq!(finished_runs(&out), 6);
+    let table = fs::read_to_string(out.join("ablation.md")).expect("a table");
+    assert!(said.contains(&table), "{said}");
+    for words in [
+        "| DEMC | 4 | ",
+        "| SEMC | 5 | ",
+        "| color-only | ",
+        "4 test images and 2 seeds (1, 2)",
+        "- color-only against DEMC: ",
+        "the same batches in the same order",
+    ] {
+        assert!(table.contains(words), "{words}: {table}");
+    }
+    for ending in ["csv", "json", "svg", "png"] {
+        assert!(out.join(format!("ablation.{ending}")).is_file(), "{ending}");
+    }
+
+    // The mean of the table is that of the runs' own scores.
+    let json = |path: &Path| -> serde_json::Value {
+        serde_json::from_slice(&fs::read(path).expect("a file")).expect("JSON")
+    };
+    let row = &json(&out.join("ablation.json"))["rows"][0];
+    let scores = [1, 2].map(|seed| {
+        let report = json(&out.join(format!("DEMC-seed-{seed}/test.json")));
+        report["mean"]["denoised"]["relmse"]
+            .as_f64()
+            .expect("a score")
+    });
+    let mean = row["relmse"]["mean"].as_f64().expect("a mean");
+    assert!((mean - (scores[0] + scores[1]) / 2.0).abs() < 1e-12);
+    assert!(scores[0] != scores[1], "seeds differ");
+
+    // The same batches: patches are drawn by the seed alone, so losses before the first step differ by the network only.
+    let other = error_line(
+        &run(&[&args[..], &["--set", "train.lr_start=0.5"]].concat()),
+        1,
+    );
+    assert!(
+        other.contains("train.lr_start = 0.5, there 0.001"),
+        "{other}"
+    );
+}
+
+#[test]
+fn bad_ablations_exit_with_2_and_one_line() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let spec = ablation(dir.path());
+    let text_of = fs::read_to_string(&spec).expect("a file");
+    fs::write(&spec, text_of.replace("SEMC", "DEMC")).expect("a file");
+    let error = error_line(&run(&["ablate", "--config", text(&spec)]), 2);
+    assert!(error.contains("`DEMC` twice"), "{error}");
+    let error = error_line(&run(&["ablate", "--config", "/nowhere.toml"]), 2);
+    assert!(error.contains("/nowhere.toml"), "{error}");
+}
+
+#[test]
+fn a_sweep_finds_a_rate_and_leaves_a_table_and_a_picture() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    let stem = dir.path().join("new/sweep");
+    // Without the batch normalisation that keeps any step in bounds.
+    let paper = ["--set", "model.reading=paper"];
+    let args = ["find-lr", "--config", text(&config), "--out", text(&stem)];
+    let args = [&args[..], &paper].concat();
+    let said = stdout(&run(&[
+        &args[..],
+        &["--from", "1e-5", "--to", "1e3", "--steps", "120"],
+    ]
+    .concat()));
+    assert!(
+        said.contains("the loss diverged at a learning rate of "),
+        "{said}"
+    );
+    let suggestion = said.split("train.lr_start=").nth(1).expect("a suggestion");
+    let rate: f64 = suggestion
+        .split(',')
+        .next()
+        .and_then(|s| s.parse().ok())
+        .expect("a number");
+    let csv = fs::read_to_string(dir.path().join("new/sweep.csv")).expect("a table");
+    let rates: Vec<f64> = csv
+        .lines()
+        .skip(1)
+        .map(|line| {
+            line.split(',')
+                .nth(1)
+                .and_then(|s| s.parse().ok())
+                .expect("a rate")
+        })
+        .collect();
+    assert!(rates.is_sorted() && rates.len() < 120, "{}", rates.len());
+    let last = rates.last().expect("a rate");
+    assert!(rate > 1e-5 && rate < last / 2.0, "{rate} of {last}");
+    assert!(dir.path().join("new/sweep.png").is_file());
+    assert!(
+        !dir.path().join("runs").exists(),
+        "no run directory is touched"
+    );
+
+    let error = error_line(
+        &run(&[&args[..], &["--from", "1", "--to", "0.1"]].concat()),
+        1,
+    );
+    assert!(error.contains("must be positive and climb"), "{error}");
+}
+
+#[test]
+fn curves_of_runs_are_drawn_while_they_go_on_too() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    let runs = ["one", "two"].map(|name| dir.path().join(name));
+    for (seed, path) in runs.iter().enumerate() {
+        let seed = format!("train.seed={seed}");
+        assert!(train(&config, path, &["--set", &seed]).status.success());
+    }
+    assert!(!metrics(&runs[0]).is_empty());
+    let stem = dir.path().join("both");
+    let said = stdout(&run(&[
+        "plot",
+        text(&runs[0]),
+        text(&runs[1]),
+        "--out",
+        text(&stem),
+    ]));
+    assert!(
+        said.contains("both.svg") && said.contains("both.png"),
+        "{said}"
+    );
+    let svg = fs::read_to_string(dir.path().join("both.svg")).expect("a picture");
+    for words in [">one<", ">two<", "validation RelMSE"] {
+        assert!(svg.replace('\n', "").contains(words), "{words}");
+    }
+    stdout(&run(&["plot", text(&runs[0])]));
+    assert!(runs[0].join("curves.png").is_file());
+    let error = error_line(&run(&["plot", text(dir.path())]), 1);
+    assert!(error.contains("metrics.jsonl"), "{error}");
+}
