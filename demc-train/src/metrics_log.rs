@@ -36,7 +36,7 @@ pub struct Line {
     /// Mean SSIM of the validation scenes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub valid_ssim: Option<f64>,
-    /// Channels of the detail map that are zero in every validation scene.
+    /// Channels of the detail map that are zero nearly everywhere in the validation scenes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dead_channels: Option<usize>,
     /// Share of the output's values that are zero where the reference is above 0.01.

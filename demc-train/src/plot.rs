@@ -81,7 +81,7 @@ fn panels(runs: &[(&String, &Vec<Logged>)], options: &PlotOptions) -> Vec<Panel>
         let mut raw = curve(name, color, lines, |line| line.loss);
         if options.smooth > 0.0 {
             let mut smooth = raw.clone();
-            smooth.points = smoothed(&raw.points, options.smooth);
+            smooth.points = smoothed(&raw.points, options.smooth, scale);
             losses.push(smooth);
             raw.faint = true;
         }
@@ -144,16 +144,22 @@ fn curve(
 }
 
 /// The exponential mean `m_n = w m_(n-1) + (1 - w) y_n` from `m_0 = 0`, divided by `1 - w^n`, the sum of its weights.
-/// What is not finite stays and does not count.
-fn smoothed(points: &[(f64, f64)], weight: f64) -> Vec<(f64, f64)> {
+/// On a logarithmic axis it is that of the logarithms: a start ten times higher would hang over the curve for long. What has
+/// no place on the axis stays and does not count.
+fn smoothed(points: &[(f64, f64)], weight: f64, scale: Scale) -> Vec<(f64, f64)> {
     let (mut mean, mut missing) = (0.0, 1.0);
+    let (to, back): (fn(f64) -> f64, fn(f64) -> f64) = match scale {
+        Scale::Linear => (|y| y, |y| y),
+        Scale::Log => (f64::ln, f64::exp),
+    };
     let smooth = |&(x, y): &(f64, f64)| {
-        if !y.is_finite() {
+        let place = to(y);
+        if !place.is_finite() {
             return (x, y);
         }
-        mean = weight * mean + (1.0 - weight) * y;
+        mean = weight * mean + (1.0 - weight) * place;
         missing *= weight;
-        (x, mean / (1.0 - missing))
+        (x, back(mean / (1.0 - missing)))
     };
     points.iter().map(smooth).collect()
 }
@@ -208,7 +214,7 @@ mod tests {
     #[test]
     fn smoothing_is_corrected_for_its_start() {
         let points = [(1.0, 4.0), (2.0, f64::NAN), (3.0, 1.0), (4.0, 2.0)];
-        let smooth = smoothed(&points, 0.5);
+        let smooth = smoothed(&points, 0.5, Scale::Linear);
         // Means 2, 1.5, 1.75 over 1/2, 3/4, 7/8.
         assert_eq!(
             [smooth[0], smooth[2], smooth[3]],
@@ -216,13 +222,13 @@ mod tests {
         );
         assert!(smooth[1].1.is_nan());
         let constant: Vec<_> = (0..100).map(|x| (f64::from(x), 0.3)).collect();
-        let smooth = smoothed(&constant, 0.97);
+        let smooth = smoothed(&constant, 0.97, Scale::Linear);
         // A hundred roundings, and a division by 0.03 at the start.
         assert!(
             smooth.iter().all(|point| (point.1 - 0.3).abs() < 1e-13),
             "{smooth:?}"
         );
-        assert_eq!(smoothed(&constant, 0.0), constant);
+        assert_eq!(smoothed(&constant, 0.0, Scale::Linear), constant);
     }
 
     #[test]
@@ -278,6 +284,15 @@ mod tests {
         let error = failure(&[torn, broken], &stem, &OPTIONS);
         assert!(error.contains("broken/metrics.jsonl: line 2: "), "{error}");
         assert!(!dir.path().join("chart.svg").exists());
+    }
+
+    #[test]
+    fn on_a_logarithmic_axis_the_mean_is_geometric() {
+        let points = [(1.0, 100.0), (2.0, 0.0), (3.0, 1.0)];
+        let found = smoothed(&points, 0.5, Scale::Log);
+        // Weights 1/3 and 2/3 on 100 and 1; a loss of 0 has no place.
+        assert!((found[2].1 - 100f64.powf(1.0 / 3.0)).abs() < 1e-12);
+        assert_eq!(found[1], (2.0, 0.0));
     }
 
     #[test]

@@ -27,6 +27,8 @@ pub struct LearningRate {
     pub decay: Decay,
     /// Steps of the run.
     pub steps: u64,
+    /// Steps at the beginning over which the rate climbs to what it would be without them; 0: none.
+    pub warmup: u64,
 }
 
 impl LearningRate {
@@ -34,14 +36,19 @@ impl LearningRate {
     pub fn at(&self, step: u64) -> f64 {
         let Self { start, end, .. } = *self;
         let done = step as f64 / self.steps as f64;
-        match self.decay {
-            Decay::Exponential => start * (end / start).powf(done),
-            Decay::Cosine => {
-                end + (start - end) * 0.5 * (1.0 + (std::f64::consts::PI * done).cos())
+        let climbed = match self.warmup {
+            0 => 1.0,
+            warmup => f64::min(1.0, (step + 1) as f64 / warmup as f64),
+        };
+        climbed
+            * match self.decay {
+                Decay::Exponential => start * (end / start).powf(done),
+                Decay::Cosine => {
+                    end + (start - end) * 0.5 * (1.0 + (std::f64::consts::PI * done).cos())
+                }
+                Decay::Linear => start + (end - start) * done,
+                Decay::Constant => start,
             }
-            Decay::Linear => start + (end - start) * done,
-            Decay::Constant => start,
-        }
     }
 }
 
@@ -55,7 +62,20 @@ mod tests {
             end: 5e-6,
             decay,
             steps: 1000,
+            warmup: 0,
         }
+    }
+
+    #[test]
+    fn a_warm_rate_climbs_evenly_and_is_then_as_without() {
+        let plain = rate(Decay::Cosine);
+        let warm = LearningRate {
+            warmup: 100,
+            ..plain
+        };
+        assert_eq!(warm.at(0), 0.01 * plain.at(0));
+        assert!((0..99).all(|step| warm.at(step) < warm.at(step + 1)));
+        assert!((99..1000).all(|step| warm.at(step) == plain.at(step)));
     }
 
     #[test]

@@ -151,9 +151,8 @@ impl Watch {
         if dead > 0 {
             warnings.extend(self.once(Topic::DeadChannels, || {
                 format!(
-                    "{dead} of the detail map's 3 channels are zero in every validation scene: the features' encoder sees \
-                     that much less, and a dead channel rarely comes back. Another train.seed or a smaller train.lr_start \
-                     helps as a rule"
+                    "{dead} of the detail map's 3 channels are zero nearly everywhere: the encoder behind it sees that much \
+                     less of the features, and a dead channel rarely comes back. train.warmup helps as a rule"
                 )
             }));
         }

@@ -1,17 +1,13 @@
 //! Charts as SVG and PNG: lines over steps, bars with intervals.
 //!
-//! A [`Figure`] becomes shapes at places in pixels (`page` lays out the panels, `lines` and `bars` fill them, `frame`
-//! draws what is around them, `axis` chooses ranges and ticks), and `paint`, which alone knows `plotters`, makes
-//! files of the shapes. Nothing is read from the system: the font for the PNG is embedded, the SVG asks for the
-//! generic `sans-serif`.
+//! `plotters` draws: its charts, meshes, series and legends. What is here is what it does not choose: how far an axis
+//! reaches and which values it names (`axis`), and what a panel shows (`lines`, `bars`, around them `page`). Nothing
+//! is read from the system: the font for the PNG is embedded, the SVG asks for the generic `sans-serif`.
 
 mod axis;
 mod bars;
-mod frame;
 mod lines;
 mod page;
-mod paint;
-mod shape;
 #[cfg(test)]
 mod tests;
 
@@ -19,8 +15,15 @@ use std::ffi::OsString;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, anyhow, ensure};
 use demc_data::file::write_whole;
+use plotters::prelude::*;
+use plotters::style::register_font;
+
+use page::Page;
+
+/// The files have this many pixels for one that the SVG asks for: text stays sharp on dense displays.
+const DENSITY: u32 = 2;
 
 /// A line of points.
 #[derive(Clone, Debug, PartialEq)]
@@ -31,7 +34,7 @@ pub struct Series {
     pub points: Vec<(f64, f64)>,
     /// Drawn thin and pale under the others, without legend entry (raw values under a smoothed curve).
     pub faint: bool,
-    /// Colour: index in the palette of eight; after the last, it begins again in dashes.
+    /// Colour: index in the palette of eight; after the last, it begins again greyer.
     pub color: usize,
 }
 
@@ -112,9 +115,15 @@ impl Figure {
         let name = stem.to_string_lossy();
         let is_name = stem.file_name().is_some() && !name.ends_with(std::path::is_separator);
         ensure!(is_name, "{name}: names no file to draw to");
-        let drawing = page::drawn(self, paint::Font::embedded()?);
-        let svg = paint::svg(&drawing).with_context(|| format!("{name}.svg"))?;
-        let png = paint::png(&drawing).with_context(|| format!("{name}.png"))?;
+        register_font(
+            FontFamily::SansSerif.as_str(),
+            FontStyle::Normal,
+            epaint_default_fonts::UBUNTU_LIGHT,
+        )
+        .map_err(|_| anyhow!("the embedded font cannot be read"))?;
+        let page = Page::of(self);
+        let svg = svg(&page).with_context(|| format!("{name}.svg"))?;
+        let png = png(&page).with_context(|| format!("{name}.png"))?;
         let paths = ["svg", "png"].map(|kind| with_kind(stem, kind));
         for (path, bytes) in paths.iter().zip([svg.as_bytes(), &png]) {
             write_whole(path, |file| file.write_all(bytes))?;
@@ -129,4 +138,33 @@ fn with_kind(stem: &Path, kind: &str) -> PathBuf {
     path.push(".");
     path.push(kind);
     path.into()
+}
+
+/// The text of an SVG file.
+fn svg(page: &Page) -> anyhow::Result<String> {
+    let mut text = String::new();
+    let size = page.size();
+    let root = SVGBackend::with_string(&mut text, size).into_drawing_area();
+    page.draw(&root, false)?;
+    drop(root);
+    let sides = |width, height| format!("width=\"{width}\" height=\"{height}\"");
+    let shown = sides(size.0 / DENSITY, size.1 / DENSITY);
+    Ok(text.replacen(&sides(size.0, size.1), &shown, 1))
+}
+
+/// The bytes of a PNG file.
+fn png(page: &Page) -> anyhow::Result<Vec<u8>> {
+    let (width, height) = page.size();
+    let mut pixels = vec![255; width as usize * height as usize * 3];
+    let root = BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area();
+    page.draw(&root, true)?;
+    drop(root);
+    let mut bytes = Vec::new();
+    let mut encoder = png::Encoder::new(&mut bytes, width, height);
+    encoder.set_color(png::ColorType::Rgb);
+    encoder.set_depth(png::BitDepth::Eight);
+    let mut writer = encoder.write_header().context("PNG header")?;
+    writer.write_image_data(&pixels)?;
+    writer.finish()?;
+    Ok(bytes)
 }

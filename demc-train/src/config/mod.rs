@@ -65,6 +65,8 @@ pub struct TrainConfig {
     pub lr_end: f64,
     /// The way from the one to the other.
     pub decay: Decay,
+    /// Steps at the beginning over which the learning rate climbs from nearly 0 to its course; 0: none, as in the paper.
+    pub warmup: u64,
     /// Adam's epsilon.
     pub adam_epsilon: f32,
     /// What is minimised.
@@ -92,6 +94,7 @@ impl Default for TrainConfig {
             lr_start: LR_START,
             lr_end: LR_END,
             decay: Decay::Exponential,
+            warmup: 0,
             adam_epsilon: ADAM_EPSILON,
             loss: Loss::default(),
             loss_epsilon: demc_model::metrics::LOSS_EPSILON,
@@ -269,6 +272,12 @@ impl Config {
             "0 (off) or a positive number",
         );
         require(
+            train.warmup <= MOST_STEPS,
+            "train.warmup",
+            &train.warmup,
+            "at most 1000000000",
+        );
+        require(
             run.keep_every <= MOST_STEPS,
             "run.keep_every",
             &run.keep_every,
@@ -296,6 +305,7 @@ impl Config {
             lr_start,
             lr_end,
             decay,
+            warmup,
             ..
         } = self.train;
         LearningRate {
@@ -303,6 +313,7 @@ impl Config {
             end: lr_end,
             decay,
             steps,
+            warmup,
         }
     }
 
@@ -381,6 +392,21 @@ mod tests {
             );
         }
         assert_eq!(problems.len(), 4);
+    }
+
+    /// The file that the documentation calls the reference.
+    #[test]
+    fn demc_toml_names_every_key_with_its_default() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/demc.toml");
+        let text = std::fs::read_to_string(path).unwrap();
+        let mut config: Config = toml::from_str(&text).unwrap();
+        config.run.dir = PathBuf::new();
+        assert_eq!(config, Config::default());
+        let table: toml::Table = text.parse().unwrap();
+        for key in source::leaves(&config).keys() {
+            let (outer, inner) = key.split_once('.').unwrap();
+            assert!(table[outer].get(inner).is_some(), "{key}");
+        }
     }
 
     #[test]
