@@ -178,3 +178,31 @@ fn channels_that_do_not_fit_the_layout_are_listed() {
         outcome.stderr
     );
 }
+
+/// Without `--model` the program uses the one that it comes with, which never saw the sample's test scenes.
+#[test]
+fn the_programs_own_model_denoises() {
+    let out = tempfile::tempdir().expect("directory");
+    let layout = random_bundle().meta.layout;
+    for name in ["col-classroom-1.exr", "gen-room-test-1.exr"] {
+        let input = sample_image(name);
+        let output = out.path().join(name);
+        demc_infer(arguments!["denoise", input, "-o", output]).success();
+        let frame = read_frame(&input, &layout).expect("frame");
+        let reference = frame.reference.as_deref().expect("a reference");
+        let denoised: Vec<f32> = read_rgb(&output).iter().flat_map(Plane::to_f32).collect();
+        let error = |image: &[f32]| demc_model::metrics::rel_mse_image(image, reference);
+        let (noisy, black) = (error(&frame.color), error(&vec![0.0; reference.len()]));
+        let found = error(&denoised);
+        assert!(found < 0.15 * noisy.min(black), "{name}: {found}");
+    }
+    let shown = demc_infer(arguments!["inspect"]).success();
+    assert!(shown.stdout.contains("demc-infer"), "{}", shown.stdout);
+}
+
+/// It is part of the program and of the repository.
+#[test]
+fn the_programs_own_model_is_small() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/demc.safetensors");
+    assert!(fs::metadata(path).expect("a model").len() <= 30_000_000);
+}

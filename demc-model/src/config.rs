@@ -65,6 +65,19 @@ pub enum Head {
     Xavier,
 }
 
+/// How the detail map starts, the output of the fusion sub-network. Its activation is a ReLU: a channel that falls below zero
+/// everywhere has no gradient and stays there.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Detail {
+    /// Above zero nearly everywhere: a bias of [`crate::init::OPEN_BIAS`] for the last convolution. Ours: with a bias of zero two of
+    /// the three channels were zero at 97 % of the pixels or more after some hundred steps, whatever the seed.
+    #[default]
+    Open,
+    /// A bias of zero, as everywhere else.
+    Xavier,
+}
+
 /// One of the images that the network sees.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Input {
@@ -190,6 +203,8 @@ pub struct ModelConfig {
     pub width: usize,
     /// How the output convolution starts.
     pub head: Head,
+    /// How the detail map starts.
+    pub detail: Detail,
 }
 
 impl Default for ModelConfig {
@@ -200,6 +215,7 @@ impl Default for ModelConfig {
             reading: Reading::Paper,
             width: 64,
             head: Head::Grey,
+            detail: Detail::Open,
         }
     }
 }

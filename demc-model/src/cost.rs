@@ -98,7 +98,7 @@ fn share_of_pixels(name: &str) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Head, Reading, Variant};
+    use crate::config::{Detail, Head, Reading, Variant};
 
     fn config(variant: Variant, reading: Reading, width: usize) -> ModelConfig {
         ModelConfig {
@@ -106,6 +106,7 @@ mod tests {
             reading,
             width,
             head: Head::Grey,
+            detail: Detail::default(),
         }
     }
 

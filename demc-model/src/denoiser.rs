@@ -9,6 +9,7 @@ use crate::decoder::Decoder;
 use crate::encoder::{Encoded, Encoder};
 use crate::fusion::Fusion;
 use crate::inference;
+use crate::init::Init;
 use crate::layers::ConvBlock;
 use crate::ops::{self, Maps, Ops};
 use crate::weights::{Builder, Weight, Weights, WeightsError, collect, drawn, taken};
@@ -70,7 +71,7 @@ impl Denoiser {
         let spec = config.variant.spec();
         let deepest = config.level_channels()[LEVELS - 1];
         let fusion = match spec.has_fusion() {
-            true => Some(b.part("fusion", |b| Fusion::build(b, config.width))?),
+            true => Some(b.part("fusion", |b| Fusion::build(b, config.width, config.detail))?),
             false => None,
         };
         let encoders = b.list("encoders", spec.encoders.len(), |b, e| {
@@ -79,7 +80,7 @@ impl Denoiser {
         })?;
         let normalised = config.reading.spec().normalised_decoder;
         let latent = b.part("latent", |b| {
-            ConvBlock::build(b, [deepest, deepest], normalised)
+            ConvBlock::build(b, [deepest, deepest], normalised, Init::Zeros)
         })?;
         let decoder = b.part("decoder", |b| Decoder::build(b, config, head_bias))?;
         Ok(Denoiser {

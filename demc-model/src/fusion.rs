@@ -2,7 +2,8 @@
 
 use burn::module::Module;
 
-use crate::config::{DETAIL_CHANNELS, FEATURE_CHANNELS};
+use crate::config::{DETAIL_CHANNELS, Detail, FEATURE_CHANNELS};
+use crate::init::{Init, OPEN_BIAS};
 use crate::layers::ConvBlock;
 use crate::ops::Maps;
 use crate::weights::{Builder, WeightsError};
@@ -15,17 +16,25 @@ pub struct Fusion {
 }
 
 impl Fusion {
-    pub(crate) fn build(b: &mut Builder, width: usize) -> Result<Self, WeightsError> {
+    pub(crate) fn build(
+        b: &mut Builder,
+        width: usize,
+        detail: Detail,
+    ) -> Result<Self, WeightsError> {
+        let start = match detail {
+            Detail::Open => Init::Color([OPEN_BIAS; DETAIL_CHANNELS]),
+            Detail::Xavier => Init::Zeros,
+        };
         let blocks = [
-            ([FEATURE_CHANNELS, width], false),
-            ([width, width], true),
-            ([width, width], true),
-            ([width, DETAIL_CHANNELS], false),
+            ([FEATURE_CHANNELS, width], false, Init::Zeros),
+            ([width, width], true, Init::Zeros),
+            ([width, width], true, Init::Zeros),
+            ([width, DETAIL_CHANNELS], false, start),
         ];
         Ok(Fusion {
             blocks: b.list("blocks", blocks.len(), |b, i| {
-                let (channels, normalised) = blocks[i];
-                ConvBlock::build(b, channels, normalised)
+                let (channels, normalised, bias) = blocks[i];
+                ConvBlock::build(b, channels, normalised, bias)
             })?,
         })
     }

@@ -8,6 +8,9 @@ use rand::{Rng, RngExt};
 /// Factor on the Xavier weights of a grey head; ours: with 0.1 no output starts below zero.
 pub const GREY_HEAD_SCALE: f32 = 0.1;
 
+/// Bias of the detail map's convolution that starts open; ours: the convolution's output has a deviation of about 1.
+pub const OPEN_BIAS: f32 = 1.0;
+
 /// How one tensor starts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Init {
@@ -21,7 +24,7 @@ pub enum Init {
     Bilinear,
     /// `[I I I]` (Eq. 3): the skip fusion starts as the sum of its inputs.
     IdentitySum,
-    /// Three given values: the bias of a grey head.
+    /// Three given values: the bias of a grey head or an open detail map.
     Color([f32; 3]),
 }
 

@@ -27,16 +27,15 @@ pub struct ConvBlock {
 }
 
 impl ConvBlock {
-    /// A block from `input` to `output` channels.
+    /// A block from `input` to `output` channels, whose convolution starts with this bias.
     pub(crate) fn build(
         b: &mut Builder,
         channels: [usize; 2],
         normalised: bool,
+        bias: Init,
     ) -> Result<Self, WeightsError> {
         Ok(ConvBlock {
-            conv: b.part("conv", |b| {
-                conv3x3(b, channels, Init::Xavier(1.0), Init::Zeros)
-            })?,
+            conv: b.part("conv", |b| conv3x3(b, channels, Init::Xavier(1.0), bias))?,
             norm: normalised
                 .then(|| b.part("norm", |b| norm(b, channels[1])))
                 .transpose()?,

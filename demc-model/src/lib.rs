@@ -24,7 +24,7 @@ pub mod metrics;
 pub mod ops;
 pub mod weights;
 
-pub use config::{DOWNSAMPLING, Head, ModelConfig, Reading, Variant};
+pub use config::{DOWNSAMPLING, Detail, Head, ModelConfig, Reading, Variant};
 pub use denoiser::Denoiser;
 pub use loss::Loss;
 pub use ops::Ops;

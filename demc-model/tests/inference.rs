@@ -1,7 +1,7 @@
 //! Inference against the same network on Burn's operations, which knows nothing of folding, bands or larger tiles.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use demc_model::{Denoiser, Head, ModelConfig, Ops, Reading, Variant, Weights};
+use demc_model::{Denoiser, Detail, Head, ModelConfig, Ops, Reading, Variant, Weights};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -15,6 +15,7 @@ fn network(variant: Variant, reading: Reading, width: usize) -> Denoiser {
         reading,
         width,
         head: Head::Grey,
+        detail: Detail::default(),
     };
     let mut rng = ChaCha8Rng::seed_from_u64(5);
     let mut weights = config.init(&mut rng, [0.5; 3], &Device::flex()).weights();

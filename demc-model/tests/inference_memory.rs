@@ -5,7 +5,7 @@
 use burn::tensor::{Device, Tensor};
 use demc_kernels::memory::{Recycler, used};
 use demc_model::inference::peak_bytes;
-use demc_model::{Head, ModelConfig, Reading, Variant};
+use demc_model::{Detail, Head, ModelConfig, Reading, Variant};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -40,6 +40,7 @@ fn check() {
             reading,
             width,
             head: Head::Grey,
+            detail: Detail::default(),
         };
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let model = config.init(&mut rng, [0.5; 3], &device);

@@ -1,7 +1,8 @@
 //! What must hold of every variant in every reading before any number is compared with PyTorch.
 
 use burn::tensor::{Device, Distribution, Tensor, TensorData};
-use demc_model::{Denoiser, Head, ModelConfig, Reading, Variant, Weights, WeightsError};
+use demc_model::init::OPEN_BIAS;
+use demc_model::{Denoiser, Detail, Head, ModelConfig, Reading, Variant, Weights, WeightsError};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -13,6 +14,7 @@ fn config(variant: Variant, reading: Reading, width: usize) -> ModelConfig {
         reading,
         width,
         head: Head::Grey,
+        detail: Detail::default(),
     }
 }
 
@@ -98,16 +100,42 @@ fn autodiff_device_draws_the_same_weights() {
 }
 
 #[test]
-fn biases_start_at_zero_but_for_the_grey_head() {
+fn biases_start_at_zero_but_for_the_grey_head_and_the_open_detail_map() {
     for (variant, reading) in every_network() {
         for weight in network(config(variant, reading, 3), 1, &Device::flex()).weights() {
             if weight.name == "decoder.head.bias" {
                 assert_eq!(weight.data, GREY);
+            } else if weight.name == "fusion.blocks.3.conv.bias" {
+                assert_eq!(weight.data, [OPEN_BIAS; 3]);
             } else if weight.name.ends_with(".bias") {
                 assert!(weight.data.iter().all(|v| *v == 0.0), "{}", weight.name);
             }
         }
     }
+}
+
+/// How much of each channel of a new network's detail map is zero.
+fn dead_share(detail: Detail, seed: u64) -> Vec<f64> {
+    let device = Device::flex();
+    let config = ModelConfig {
+        detail,
+        ..config(Variant::Demc, Reading::Paper, 8)
+    };
+    let map = network(config, seed, &device).detail_map(pattern([1, 12, 64, 64], 0.5, &device));
+    let map = values(map.expect("DEMC has one"));
+    let share =
+        |plane: &[f32]| plane.iter().filter(|v| **v == 0.0).count() as f64 / plane.len() as f64;
+    map.chunks(64 * 64).map(share).collect()
+}
+
+#[test]
+fn an_open_detail_map_starts_above_zero_nearly_everywhere() {
+    let most = |detail| {
+        let all: Vec<f64> = (1..=5).flat_map(|seed| dead_share(detail, seed)).collect();
+        all.iter().sum::<f64>() / all.len() as f64
+    };
+    let (open, xavier) = (most(Detail::Open), most(Detail::Xavier));
+    assert!(open < 0.2 && xavier > 0.3, "{open} {xavier}");
 }
 
 /// Eq. 3: with [I I I] a fusion is the sum of decoder and skips.

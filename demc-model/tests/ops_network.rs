@@ -7,7 +7,7 @@ use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_model::Loss;
 use demc_model::metrics::LOSS_EPSILON;
-use demc_model::{Denoiser, Head, ModelConfig, Ops, Reading, Variant};
+use demc_model::{Denoiser, Detail, Head, ModelConfig, Ops, Reading, Variant};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -37,6 +37,7 @@ fn network(variant: Variant, reading: Reading, ops: Ops, device: &Device) -> Den
         reading,
         width: WIDTH,
         head: Head::Grey,
+        detail: Detail::default(),
     };
     // With one seed in six, a value so close to 0 turns up that the two rectify it differently: a real difference.
     let mut rng = ChaCha8Rng::seed_from_u64(12);

@@ -24,6 +24,8 @@ BN_EPSILON = 1e-3
 """TensorFlow's default, which the authors' code uses."""
 BN_MOMENTUM = 0.01
 """Share of the new batch in the running statistics: TensorFlow's momentum 0.99."""
+OPEN_BIAS = 1.0
+"""Bias of the detail map's convolution that starts open (ours)."""
 GREY_HEAD_SCALE = 0.1
 """What a grey head multiplies its Xavier weights by (ours)."""
 
@@ -63,18 +65,20 @@ READINGS = {
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The `model` part of a bundle's metadata. `head` says only how training started: it changes no computation."""
+    """The `model` part of a bundle's metadata. `head` and `detail` say only how training started: they change no computation."""
 
     variant: str = "demc"
     reading: str = "paper"
     width: int = 64
     head: str = "grey"
+    detail: str = "open"
 
     def __post_init__(self) -> None:
         for what, value, known in (
             ("variant", self.variant, VARIANTS),
             ("reading", self.reading, READINGS),
             ("head", self.head, ("grey", "xavier")),
+            ("detail", self.detail, ("open", "xavier")),
         ):
             if value not in known:
                 raise ValueError(f"unknown {what} {value!r}: expected one of {', '.join(known)}")
@@ -274,6 +278,8 @@ class Denoiser(nn.Module):
         if self.config.head == "grey":
             self.decoder.head.weight.mul_(GREY_HEAD_SCALE)
             self.decoder.head.bias.copy_(torch.tensor(head_bias))
+        if self.fusion is not None and self.config.detail == "open":
+            self.fusion.blocks[-1].conv.bias.fill_(OPEN_BIAS)
 
 
 def bilinear_kernel(in_channels: int, out_channels: int) -> Tensor:

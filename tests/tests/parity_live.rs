@@ -14,7 +14,7 @@ use std::process::{Command, Output};
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_data::{ChannelLayout, FeatureStats, Normalizer};
 use demc_infer::{Bundle, BundleMeta, Names, Precision};
-use demc_model::{Head, ModelConfig, Reading, Variant, Weight, Weights};
+use demc_model::{Detail, Head, ModelConfig, Reading, Variant, Weight, Weights};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use safetensors::tensor::{Dtype, TensorView};
@@ -161,6 +161,7 @@ fn random_bundle(variant: Variant, reading: Reading, rng: &mut ChaCha8Rng) -> Bu
         reading,
         width: WIDTH,
         head: Head::Grey,
+        detail: Detail::default(),
     };
     let device = Device::flex();
     let mut weights = config.init(rng, [0.5, 0.4, 0.3], &device).weights();

@@ -40,16 +40,24 @@ impl BundleFile {
             path: path.clone(),
             source,
         })?;
+        Self::parse(path, &bytes)
+    }
+
+    /// Takes the bytes of a bundle file apart; `path` is what errors call it.
+    ///
+    /// # Errors
+    /// As [`read`](Self::read), but for reading.
+    pub fn parse(path: PathBuf, bytes: &[u8]) -> Result<Self, BundleError> {
         let damaged = |error: safetensors::SafeTensorError| BundleError::Damaged {
             path: path.clone(),
             detail: error.to_string(),
         };
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(damaged)?;
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
         let entry = header.metadata().as_ref().and_then(|all| all.get(KEY));
         let entry = entry.ok_or_else(|| BundleError::Foreign { path: path.clone() })?;
         let (meta, names) = parse_header(entry, &path)?;
 
-        let tensors = SafeTensors::deserialize(&bytes).map_err(damaged)?;
+        let tensors = SafeTensors::deserialize(bytes).map_err(damaged)?;
         let mut precision = Precision::F32;
         let mut weights = Vec::with_capacity(tensors.len());
         for (name, view) in tensors.iter() {

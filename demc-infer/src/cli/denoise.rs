@@ -20,6 +20,7 @@ use crate::progress::Progress;
 /// A file that fails is reported, the others are still denoised, and the exit code is 1 in the end.
 #[derive(Args)]
 #[command(after_help = "Examples:
+  demc-infer denoise noisy.exr -o clean.exr
   demc-infer denoise --model runs/quickstart noisy.exr -o clean.exr
   demc-infer denoise --model demc.safetensors frames/*.exr -o denoised/")]
 pub struct Denoise {

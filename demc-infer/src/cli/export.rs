@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
-use demc_infer::{BundleFile, Names, Precision};
+use demc_infer::{Names, Precision};
 
 use super::{Model, Usage, print};
 
@@ -54,7 +54,7 @@ enum PrecisionFlag {
 impl Export {
     /// Loads, writes, reads back, reports.
     pub fn run(self) -> anyhow::Result<()> {
-        let file = BundleFile::read(&self.model.path)?;
+        let file = self.model.read()?;
         // Rounding to f16 cannot be taken back: the model must outlive its export.
         let model = fs::canonicalize(&file.path).ok();
         if fs::canonicalize(&self.output).is_ok_and(|output| Some(output) == model) {

@@ -8,7 +8,7 @@ use clap::Args;
 use demc_data::ChannelLayout;
 use demc_data::frame::FEATURE_NAMES;
 use demc_data::layout::Missing;
-use demc_infer::{Bundle, BundleFile, BundleMeta, Names, Precision};
+use demc_infer::{Bundle, BundleMeta, Names, Precision};
 use serde::Serialize;
 
 use super::{Model, print};
@@ -49,7 +49,7 @@ struct Summary {
 impl Inspect {
     /// Loads the model as every other command does, and prints what it is.
     pub fn run(self) -> anyhow::Result<()> {
-        let source = BundleFile::read(&self.model.path)?;
+        let source = self.model.read()?;
         let (file, names, precision) = (source.path.clone(), source.names, source.precision);
         let Bundle { meta, model } = source.into_bundle(&Device::flex())?;
         let tensors = match self.tensors {

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Parser, Subcommand};
 use demc_infer::compute::ComputeFlags;
-use demc_infer::{Bundle, device};
+use demc_infer::{Bundle, BundleError, BundleFile, device};
 
 /// Use a trained DEMC network: denoise renders, score it, export its weights.
 #[derive(Parser)]
@@ -52,10 +52,15 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
 /// `--model`, which every command has.
 #[derive(Args)]
 struct Model {
-    /// Run directory, checkpoint directory or exported file
+    /// Run directory, checkpoint directory or exported file [default: the model that comes with the program, models/README.md]
     #[arg(long = "model", value_name = "MODEL")]
-    path: PathBuf,
+    path: Option<PathBuf>,
 }
+
+/// The model that comes with the program; `models/README.md` is its card.
+const OWN_MODEL: &[u8] = include_bytes!("../../../models/demc.safetensors");
+/// What errors and `inspect` call it.
+const OWN_MODEL_NAME: &str = "the model that comes with demc-infer";
 
 /// `--device` and how it computes, for the commands that do.
 #[derive(Args)]
@@ -68,12 +73,20 @@ struct DeviceFlag {
 }
 
 impl Model {
+    /// Reads the file that was named, or the program's own.
+    fn read(&self) -> Result<BundleFile, BundleError> {
+        match &self.path {
+            Some(path) => BundleFile::read(path),
+            None => BundleFile::parse(OWN_MODEL_NAME.into(), OWN_MODEL),
+        }
+    }
+
     /// Loads onto the device called `name`.
     fn load_onto(&self, device: &DeviceFlag) -> anyhow::Result<Bundle> {
         let usage = |error: &dyn std::error::Error| Usage(error.to_string());
         device.compute.apply().map_err(|error| usage(&error))?;
         let device = device::parse(&device.name).map_err(|error| usage(&error))?;
-        Ok(Bundle::load(&self.path, &device)?)
+        Ok(self.read()?.into_bundle(&device)?)
     }
 }
 

@@ -6,7 +6,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::{Plan, forward_with};
-use crate::{Denoiser, Head, ModelConfig, Ops, Reading, Variant};
+use crate::{Denoiser, Detail, Head, ModelConfig, Ops, Reading, Variant};
 
 /// No bands: more rows than any image here.
 const WHOLE: usize = 4096;
@@ -17,6 +17,7 @@ fn network(variant: Variant, reading: Reading) -> Denoiser {
         reading,
         width: 6,
         head: Head::Xavier,
+        detail: Detail::default(),
     };
     let mut rng = ChaCha8Rng::seed_from_u64(7);
     config.init(&mut rng, [0.5; 3], &Device::flex())

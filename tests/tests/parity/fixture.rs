@@ -7,7 +7,7 @@ use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_infer::Names;
-use demc_model::{Denoiser, Head, ModelConfig, Reading, Variant, Weight, Weights};
+use demc_model::{Denoiser, Detail, Head, ModelConfig, Reading, Variant, Weight, Weights};
 
 use crate::tensors::{self, Values};
 
@@ -79,6 +79,7 @@ pub fn network(variant: Variant, reading: Reading, fixture: &Fixture, device: &D
         reading,
         width: WIDTH,
         head: Head::Grey,
+        detail: Detail::default(),
     };
     let mut weights = Weights::new(fixture.group("weight/"));
     config
