@@ -148,9 +148,9 @@ fn curve(
 /// no place on the axis stays and does not count.
 fn smoothed(points: &[(f64, f64)], weight: f64, scale: Scale) -> Vec<(f64, f64)> {
     let (mut mean, mut missing) = (0.0, 1.0);
-    let (to, back): (fn(f64) -> f64, fn(f64) -> f64) = match scale {
-        Scale::Linear => (|y| y, |y| y),
-        Scale::Log => (f64::ln, f64::exp),
+    let [to, back]: [fn(f64) -> f64; 2] = match scale {
+        Scale::Linear => [|y| y, |y| y],
+        Scale::Log => [f64::ln, f64::exp],
     };
     let smooth = |&(x, y): &(f64, f64)| {
         let place = to(y);

@@ -78,7 +78,7 @@ impl Recorder {
     pub fn picture(&mut self, step: u64, picture: &Picture) -> anyhow::Result<()> {
         write_strip(&self.run, &format!("step-{step:08}.png"), picture)?;
         let (width, height) = picture.size();
-        let tag = "noisy, detail map, denoised, reference";
+        let tag = "validation/noisy, detail map, denoised, reference";
         self.events
             .image(step, tag, width, height, &picture.to_png()?)
     }

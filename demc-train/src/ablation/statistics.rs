@@ -141,12 +141,13 @@ mod tests {
             .iter()
             .map(|x| x + 0.1 + 0.05 * normal(&mut rng))
             .collect();
-        let found = Estimate::of_difference(&[b.clone()], &[a.clone()]).unwrap();
+        let (a, b) = (vec![a], vec![b]);
+        let found = Estimate::of_difference(&b, &a).unwrap();
         assert!(
             found.is_significant() && (found.mean - 0.1).abs() < 0.05,
             "{found:?}"
         );
-        let [a, b] = [a, b].map(|row| Estimate::of(&[row]).unwrap());
+        let [a, b] = [a, b].map(|table| Estimate::of(&table).unwrap());
         assert!(a.interval[1] > b.interval[0], "unpaired they overlap");
     }
 

@@ -18,6 +18,12 @@ const MEGAPIXEL: f64 = 1e6;
 /// Operations of a GFLOP.
 const GIGA: f64 = 1e9;
 
+/// The first variant's difference from itself.
+const NOTHING: Estimate = Estimate {
+    mean: 0.0,
+    interval: [0.0; 2],
+};
+
 /// Writes all five files into `dir`.
 pub(super) fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<Vec<PathBuf>> {
     std::fs::create_dir_all(dir).with_context(|| dir.display().to_string())?;
@@ -174,42 +180,45 @@ fn csv(comparison: &Comparison) -> String {
     text
 }
 
-/// RelMSE and SSIM, and the paired differences; a dot a seed.
+/// RelMSE and SSIM with a dot a seed, and their paired differences.
 fn figure(comparison: &Comparison) -> Figure {
-    let bar = |estimate: Estimate, points: &[f64]| Bar {
-        value: estimate.mean,
-        interval: Some((estimate.interval[0], estimate.interval[1])),
-        points: points.to_vec(),
-    };
-    let panel = |title: &str, label: &str, bars: Vec<(String, Bar)>| {
-        let (names, bars) = bars.into_iter().unzip();
-        BarPanel {
-            title: title.into(),
-            y_label: label.into(),
+    type Of = fn(&Row) -> Option<(Estimate, &[f64])>;
+    let panel = |title: String, of: Of| {
+        let bars = comparison.rows.iter().filter_map(|row| {
+            let (Estimate { mean, interval }, seeds) = of(row)?;
+            let bar = Bar {
+                value: mean,
+                interval: Some(interval.into()),
+                points: seeds.to_vec(),
+            };
+            Some((row.name.clone(), bar))
+        });
+        let (names, bars): (Vec<_>, Vec<_>) = bars.unzip();
+        (!bars.is_empty()).then(|| BarPanel {
+            y_label: title.clone(),
+            title,
             names,
             bars,
             y: Scale::Linear,
-        }
+        })
     };
-    let rows = comparison.rows.iter();
-    let relmse = rows
-        .clone()
-        .map(|row| (row.name.clone(), bar(row.relmse, &row.relmse_of_seeds)));
-    let ssim = rows.filter_map(|row| Some((row.name.clone(), bar(row.ssim?, &row.ssim_of_seeds))));
-    let mut panels = vec![panel(
-        "RelMSE of the test split (lower is better)",
-        "RelMSE",
-        relmse.collect(),
-    )];
-    let ssim: Vec<_> = ssim.collect();
-    if !ssim.is_empty() {
-        panels.push(panel(
-            "SSIM of the test split (higher is better)",
-            "SSIM",
-            ssim,
-        ));
-    }
-    Figure::Bars(panels)
+    let first = comparison.rows.first().map_or("", |row| &row.name);
+    let panels = [
+        panel("RelMSE (lower is better)".into(), |row| {
+            Some((row.relmse, &row.relmse_of_seeds))
+        }),
+        panel("SSIM (higher is better)".into(), |row| {
+            Some((row.ssim?, &row.ssim_of_seeds))
+        }),
+        panel(format!("RelMSE minus that of {first}, paired"), |row| {
+            Some((row.relmse_difference.unwrap_or(NOTHING), &[]))
+        }),
+        panel(format!("SSIM minus that of {first}, paired"), |row| {
+            row.ssim?;
+            Some((row.ssim_difference.unwrap_or(NOTHING), &[]))
+        }),
+    ];
+    Figure::Bars(panels.into_iter().flatten().collect())
 }
 
 #[cfg(test)]
