@@ -123,34 +123,28 @@ impl Trainer {
         let parts = self.config.grad_accumulation;
         let statistics = RunningStatistics::of(self.model());
         let mut accumulated = GradientsAccumulator::new();
-        let mut patches = Vec::new();
-        let mut finite = true;
+        let (mut patches, mut losses) = (Vec::new(), Vec::new());
         for _ in 0..parts {
             let batch = next_batch()?;
-            let losses = self.losses(&batch);
-            let part = losses.clone().mean().div_scalar(parts as f32);
-            let host = losses.into_data().try_to_vec::<f32>();
-            let host = host.expect("losses are float32");
-            finite &= host.iter().all(|loss| loss.is_finite());
-            patches.extend(
-                batch
-                    .patches
-                    .into_iter()
-                    .zip(host.into_iter().map(f64::from)),
-            );
-            if finite {
+            let of_batch = self.losses(&batch);
+            let part = of_batch.clone().mean().div_scalar(parts as f32);
+            let host = of_batch.into_data().try_to_vec::<f32>();
+            let host = host.expect("losses are float32").into_iter().map(f64::from);
+            patches.extend(batch.patches.into_iter().zip(host.clone()));
+            losses.extend(host);
+            if losses.iter().all(|loss| loss.is_finite()) {
                 let model = self.model();
                 let gradients = GradientsParams::from_grads(part.backward(), model);
                 accumulated.accumulate(model, gradients);
             }
         }
-        let loss = patches.iter().map(|(_, loss)| loss).sum::<f64>() / patches.len() as f64;
+        let loss = losses.iter().sum::<f64>() / losses.len() as f64;
         let mut step = Step {
             loss,
             grad_norm: f64::NAN,
             patches,
         };
-        if finite {
+        if loss.is_finite() {
             let grads = accumulated.grads();
             step.grad_norm = grad_norm(self.model(), &grads);
             if step.is_finite() {
