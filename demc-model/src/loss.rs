@@ -10,16 +10,14 @@ const SMAPE_EPSILON: f32 = 0.01;
 
 /// Which distance.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Loss {
     /// Squared error relative to the reference, in linear HDR (Eq. 5): the paper's.
     #[default]
-    #[serde(rename = "relmse")]
     RelMse,
     /// Symmetric relative absolute error in linear HDR, `mean |c - r| / (|c| + |r| + 0.01)`: bright outliers weigh less.
-    #[serde(rename = "smape")]
     Smape,
     /// Mean absolute error in gamma space, where the network works.
-    #[serde(rename = "l1")]
     L1,
 }
 

@@ -12,7 +12,7 @@ use burn::tensor::Device;
 use demc_data::file::write_whole;
 use demc_data::{Batch, BatchLoader, PatchSource};
 
-use crate::chart::{Figure, Panel, Scale, Series};
+use crate::chart::{Figure, Panel, Scale, Series, with_kind};
 use crate::config::Config;
 use crate::data::Data;
 use crate::optimizer::Adam;
@@ -184,7 +184,7 @@ impl Sweep {
         if let Some(dir) = stem.parent().filter(|dir| !dir.as_os_str().is_empty()) {
             std::fs::create_dir_all(dir).with_context(|| dir.display().to_string())?;
         }
-        let csv = with_ending(stem, "csv");
+        let csv = with_kind(stem, "csv");
         write_whole(&csv, |file| {
             std::io::Write::write_all(file, self.csv().as_bytes())
         })?;
@@ -238,12 +238,6 @@ impl Sweep {
             marks: marks.into_iter().collect(),
         }])
     }
-}
-
-fn with_ending(stem: &Path, ending: &str) -> PathBuf {
-    let mut path = stem.as_os_str().to_owned();
-    path.push(format!(".{ending}"));
-    path.into()
 }
 
 /// To two digits: a suggestion is no measurement.

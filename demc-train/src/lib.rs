@@ -8,6 +8,7 @@
 pub mod ablation;
 pub mod chart;
 pub mod checkpoint;
+mod clock;
 pub mod config;
 pub mod data;
 pub mod ema;

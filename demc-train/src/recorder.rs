@@ -1,6 +1,6 @@
 //! Where a run's progress goes: `metrics.jsonl`, TensorBoard, the terminal.
 
-use std::path::Path;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use demc_infer::picture::Picture;
@@ -17,7 +17,7 @@ const TENSORBOARD: &str = "tensorboard";
 
 /// Records one session of a run.
 pub struct Recorder {
-    run: std::path::PathBuf,
+    run: PathBuf,
     metrics: Metrics,
     events: Events,
     progress: Progress,
@@ -91,11 +91,6 @@ impl Recorder {
     /// Takes the bar away.
     pub fn finish(&self) {
         self.progress.finish();
-    }
-
-    /// Where TensorBoard finds the events of the run in `run`.
-    pub fn tensorboard_dir(run: &Path) -> std::path::PathBuf {
-        run.join(TENSORBOARD)
     }
 }
 

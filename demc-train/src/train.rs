@@ -2,7 +2,6 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use burn::module::Module;
@@ -14,7 +13,8 @@ use demc_infer::evaluate::Report;
 use demc_model::Denoiser;
 
 use crate::checkpoint::{self, Best, Checkpoint, Keep, Means, State, Store};
-use crate::config::{Config, OnNan, RunConfig};
+use crate::clock::Clock;
+use crate::config::{Config, OnNan};
 use crate::data::Data;
 use crate::metrics_log::Line;
 use crate::optimizer::Adam;
@@ -29,8 +29,6 @@ use crate::watch::Setting;
 const MOST_SKIPPED: u64 = 100;
 /// Patches that an error names.
 const MOST_NAMED: usize = 8;
-/// Seconds of a minute.
-const MINUTE: f64 = 60.0;
 
 /// A run that is ready to go.
 pub struct Run {
@@ -392,37 +390,5 @@ impl Run {
         self.dir
             .write("test.json", &serde_json::to_vec_pretty(&report)?)?;
         Ok(Some((bundle.meta.step, report)))
-    }
-}
-
-/// The clock of a session: what it adds to the run's time, and when a checkpoint is due by it.
-struct Clock {
-    started: Instant,
-    before: f64,
-    saved: Instant,
-}
-
-impl Clock {
-    fn new(before: f64) -> Self {
-        let now = Instant::now();
-        Clock {
-            started: now,
-            before,
-            saved: now,
-        }
-    }
-
-    /// Seconds of the run so far.
-    fn elapsed(&self) -> f64 {
-        self.before + self.started.elapsed().as_secs_f64()
-    }
-
-    fn saved(&mut self) {
-        self.saved = Instant::now();
-    }
-
-    fn is_due(&self, run: &RunConfig) -> bool {
-        let limit = Duration::from_secs_f64(run.checkpoint_minutes * MINUTE);
-        !limit.is_zero() && self.saved.elapsed() >= limit
     }
 }

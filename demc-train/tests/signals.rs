@@ -5,17 +5,15 @@ mod common;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, ExitStatus, Stdio};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use common::{assert_same_run, command, config, metrics, stderr, train};
+use common::{assert_same_run, command, config, metrics, stderr, train, wait_until};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rustix::process::{Pid, Signal, kill_process};
 
 /// How often runs are killed.
 const KILLS: usize = 40;
-/// No child runs longer than this.
-const PATIENCE: Duration = Duration::from_secs(120);
 /// A checkpoint each step: most of the time goes into writing them.
 const EVERY_STEP: [&str; 2] = ["--set", "run.checkpoint_every=1"];
 
@@ -34,12 +32,10 @@ fn start(config: &Path, run: &Path, args: &[&str]) -> Child {
 
 /// Waits until the log has a line.
 fn wait_for_a_line(child: &mut Child, run: &Path) {
-    let started = Instant::now();
-    while metrics(run).is_empty() {
-        assert!(started.elapsed() < PATIENCE, "no progress");
+    wait_until(|| {
         assert!(child.try_wait().expect("a child").is_none(), "it ended");
-        std::thread::sleep(Duration::from_millis(5));
-    }
+        !metrics(run).is_empty()
+    });
 }
 
 /// The newest checkpoint's step.

@@ -4,9 +4,8 @@ mod common;
 
 use std::fs;
 use std::process::Stdio;
-use std::time::{Duration, Instant};
 
-use common::{command, config, error_line, metrics, stderr, train};
+use common::{command, config, error_line, metrics, stderr, train, wait_until};
 
 /// A learning rate at which one step is the end.
 const EXPLODE: [&str; 4] = ["--set", "train.lr_start=1e30", "--set", "data.validation=0"];
@@ -89,11 +88,7 @@ fn a_second_process_in_the_directory_is_refused_and_the_first_goes_on() {
         .stdout(Stdio::null())
         .spawn()
         .expect("the binary runs");
-    let started = Instant::now();
-    while metrics(&run).is_empty() {
-        assert!(started.elapsed() < Duration::from_secs(120), "no progress");
-        std::thread::sleep(Duration::from_millis(5));
-    }
+    wait_until(|| !metrics(&run).is_empty());
     let error = error_line(
         &train(&config, &run, &[&long[..], &["--resume"]].concat()),
         1,
@@ -103,11 +98,7 @@ fn a_second_process_in_the_directory_is_refused_and_the_first_goes_on() {
         "{error}"
     );
     let lines = metrics(&run).len();
-    let started = Instant::now();
-    while metrics(&run).len() <= lines + 1 {
-        assert!(started.elapsed() < Duration::from_secs(120), "no progress");
-        std::thread::sleep(Duration::from_millis(5));
-    }
+    wait_until(|| metrics(&run).len() > lines + 1);
     assert!(first.try_wait().expect("a child").is_none());
     first.kill().expect("a child");
     first.wait().expect("a child");

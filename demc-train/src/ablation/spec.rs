@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use demc_model::ModelConfig;
 use serde::Deserialize;
 
-use crate::config::{Config, ConfigError};
+use crate::config::{Config, ConfigError, one_line};
 
 /// The file.
 #[derive(Clone, Debug, Deserialize)]
@@ -89,8 +89,7 @@ impl Spec {
             source,
         })?;
         let file: File = toml::from_str(&text).map_err(|error| {
-            let message = error.to_string();
-            let message = message.split_whitespace().collect::<Vec<_>>().join(" ");
+            let message = one_line(&error.to_string());
             ConfigError::Source(format!("{}: {message}", path.display()))
         })?;
         let problems = file.problems();

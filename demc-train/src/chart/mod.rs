@@ -133,7 +133,7 @@ impl Figure {
 }
 
 /// `STEM.KIND`; unlike `Path::with_extension`, a dot in the stem stays.
-fn with_kind(stem: &Path, kind: &str) -> PathBuf {
+pub(crate) fn with_kind(stem: &Path, kind: &str) -> PathBuf {
     let mut path = OsString::from(stem);
     path.push(".");
     path.push(kind);

@@ -23,7 +23,7 @@ use anyhow::{Context, bail, ensure};
 use burn::tensor::Device;
 use demc_data::file::write_whole;
 use demc_infer::bundle::locate::{AVERAGE, BEST, MODEL};
-use demc_infer::bundle::{Bundle, BundleFile, Names, Precision, tensors};
+use demc_infer::bundle::{Bundle, Names, Precision, tensors};
 use demc_model::Denoiser;
 use serde::{Deserialize, Serialize};
 
@@ -209,30 +209,18 @@ pub fn restore_run(run: &Path, dir: &Path) -> anyhow::Result<Vec<String>> {
         if !kept.exists() {
             continue;
         }
-        // Best weights of a later step are those of a step that will be taken again.
-        let later = name == BEST && there.exists();
-        if later && same_step(&there, &kept) {
-            continue;
+        let bytes = fs::read(&kept).with_context(|| kept.display().to_string())?;
+        match fs::read(&there) {
+            // Best weights may be of a later step, which will be taken again.
+            Ok(found) if name != BEST || found == bytes => continue,
+            Ok(_) => {}
+            Err(_) => notes.push(format!(
+                "{} was gone: brought back from {}",
+                there.display(),
+                dir.display()
+            )),
         }
-        if !there.exists() || later {
-            if !there.exists() {
-                notes.push(format!(
-                    "{} was gone: brought back from {}",
-                    there.display(),
-                    dir.display()
-                ));
-            }
-            let bytes = fs::read(&kept).with_context(|| kept.display().to_string())?;
-            write_whole(&there, |file| file.write_all(&bytes))?;
-        }
+        write_whole(&there, |file| file.write_all(&bytes))?;
     }
     Ok(notes)
-}
-
-/// Whether two bundle files can be read and are of one step: then they hold the same weights.
-fn same_step(a: &Path, b: &Path) -> bool {
-    match (BundleFile::read(a), BundleFile::read(b)) {
-        (Ok(a), Ok(b)) => a.meta.step == b.meta.step && a.weights == b.weights,
-        _ => false,
-    }
 }

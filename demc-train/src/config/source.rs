@@ -145,7 +145,8 @@ fn edit(table: &mut Table, set: &str, known: &BTreeMap<String, Value>) -> Result
     Ok(())
 }
 
-fn one_line(message: &str) -> String {
+/// A message of the TOML parser without its line breaks.
+pub(crate) fn one_line(message: &str) -> String {
     message.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 

@@ -91,3 +91,12 @@ pub fn assert_same_run(whole: &Path, other: &Path, what: &str) {
         assert!(bytes(whole) == bytes(other), "{what}: {file} differs");
     }
 }
+
+/// Waits until `done`, for two minutes at most.
+pub fn wait_until(mut done: impl FnMut() -> bool) {
+    let started = std::time::Instant::now();
+    while !done() {
+        assert!(started.elapsed().as_secs() < 120, "no progress");
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+}

@@ -1,0 +1,126 @@
+//! The tables `[train]` and `[run]`, with every default and where it comes from.
+
+use std::path::PathBuf;
+
+use demc_model::Loss;
+use serde::{Deserialize, Serialize};
+
+use crate::schedule::Decay;
+
+/// Iterations (Sec. 4.2: "approximately 250K").
+const STEPS: u64 = 250_000;
+/// First learning rate (Sec. 4.2).
+const LR_START: f64 = 1e-4;
+/// Last learning rate (Sec. 4.2).
+const LR_END: f64 = 5e-6;
+/// Adam's epsilon (Kingma and Ba 2014).
+const ADAM_EPSILON: f32 = 1e-8;
+/// Ours: 1 in 50 of a run of some hundred steps, and no load on a long one.
+const LOG_EVERY: u64 = 50;
+/// Ours: about one epoch of the paper's run.
+const VALIDATE_EVERY: u64 = 1000;
+/// Ours: a stopped run loses at most as much as between two validations.
+const CHECKPOINT_EVERY: u64 = 1000;
+/// Ours: what anybody can bear to lose.
+const CHECKPOINT_MINUTES: f64 = 15.0;
+/// Ours: the last one may be the one that was being written.
+const KEEP: usize = 2;
+
+/// The `[train]` table.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainConfig {
+    /// Optimizer steps of the whole run.
+    pub steps: u64,
+    /// Learning rate of the first step.
+    pub lr_start: f64,
+    /// Learning rate towards which the run goes.
+    pub lr_end: f64,
+    /// The way from the one to the other.
+    pub decay: Decay,
+    /// Steps at the beginning over which the learning rate climbs from nearly 0 to its course; 0: none, as in the paper.
+    pub warmup: u64,
+    /// Adam's epsilon.
+    pub adam_epsilon: f32,
+    /// What is minimised.
+    pub loss: Loss,
+    /// Epsilon of the loss (Eq. 5).
+    pub loss_epsilon: f32,
+    /// Batches whose gradients are averaged in one step: a step sees `data.batch_size * grad_accumulation` patches.
+    pub grad_accumulation: usize,
+    /// Largest norm of the whole gradient; a longer one is shortened to it. 0: no limit, as in the paper.
+    pub grad_clip: f32,
+    /// Share of the moving average of the weights that a step keeps, from 0 to below 1. 0: no average, as in the paper. With
+    /// one, validation, test and `demc-infer` use the averaged weights.
+    pub ema: f64,
+    /// What happens at a loss or gradient that is not finite.
+    pub on_nan: OnNan,
+    /// Seed of weights, validation scenes, shuffling and augmentation.
+    pub seed: u64,
+}
+
+impl Default for TrainConfig {
+    /// The paper's optimisation (Sec. 4.2).
+    fn default() -> Self {
+        TrainConfig {
+            steps: STEPS,
+            lr_start: LR_START,
+            lr_end: LR_END,
+            decay: Decay::Exponential,
+            warmup: 0,
+            adam_epsilon: ADAM_EPSILON,
+            loss: Loss::default(),
+            loss_epsilon: demc_model::metrics::LOSS_EPSILON,
+            grad_accumulation: 1,
+            grad_clip: 0.0,
+            ema: 0.0,
+            on_nan: OnNan::default(),
+            seed: 1,
+        }
+    }
+}
+
+/// What happens at a loss or gradient that is not finite.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum OnNan {
+    /// The run stops and names the scenes.
+    #[default]
+    Stop,
+    /// The step is not taken, and counted.
+    Skip,
+}
+
+/// The `[run]` table.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RunConfig {
+    /// Run directory; empty: `runs/` and the configuration file's name.
+    pub dir: PathBuf,
+    /// Steps between two lines of `metrics.jsonl`.
+    pub log_every: u64,
+    /// Steps between two validations.
+    pub validate_every: u64,
+    /// Steps between two checkpoints.
+    pub checkpoint_every: u64,
+    /// Minutes after which a checkpoint is due, whatever the steps; 0: steps alone count.
+    pub checkpoint_minutes: f64,
+    /// How many of the newest checkpoints stay; the best weights of validation stay beside them.
+    pub keep: usize,
+    /// Checkpoints whose step is a multiple of this stay for good; 0: none.
+    pub keep_every: u64,
+}
+
+impl Default for RunConfig {
+    fn default() -> Self {
+        RunConfig {
+            dir: PathBuf::new(),
+            log_every: LOG_EVERY,
+            validate_every: VALIDATE_EVERY,
+            checkpoint_every: CHECKPOINT_EVERY,
+            checkpoint_minutes: CHECKPOINT_MINUTES,
+            keep: KEEP,
+            keep_every: 0,
+        }
+    }
+}
