@@ -76,7 +76,8 @@ impl PatchSource {
         assert!(!scenes.is_empty(), "training needs at least one scene");
         let patches = patches(&scenes, config.patch_size, config.stride, config.border)?;
         Ok(Self {
-            cache: SceneCache::new(scenes, layout, config.cache_mib.saturating_mul(1 << 20)),
+            cache: SceneCache::new(scenes, layout, config.cache_mib.saturating_mul(1 << 20))
+                .with_reference_filter(config.reference_filter),
             patches,
             normalizer,
             patch_size: config.patch_size,

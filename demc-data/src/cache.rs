@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::dataset::size_mismatch;
 use crate::frame::{FramePlanes, Presence};
+use crate::reference_filter::filter_reference;
 use crate::{ChannelLayout, Error, Scene};
 
 /// The scenes of a training run, decoded on demand: colour, features and reference, no mask.
@@ -14,6 +15,7 @@ pub struct SceneCache {
     scenes: Vec<Scene>,
     layout: ChannelLayout,
     budget: usize,
+    reference_filter: bool,
     /// Held by the thread that decodes a scene: others that want it wait and then find it.
     turns: Vec<Mutex<()>>,
     kept: Mutex<Kept>,
@@ -51,8 +53,17 @@ impl SceneCache {
             scenes,
             layout,
             budget,
+            reference_filter: false,
             turns,
             kept: Mutex::default(),
+        }
+    }
+
+    /// The same, with every reference filtered as it is decoded ([`crate::reference_filter`]) if `on`.
+    pub fn with_reference_filter(self, on: bool) -> Self {
+        Self {
+            reference_filter: on,
+            ..self
         }
     }
 
@@ -75,7 +86,7 @@ impl SceneCache {
             return Ok(planes);
         }
         let scene = &self.scenes[index];
-        let planes = FramePlanes::read(
+        let mut planes = FramePlanes::read(
             &scene.path,
             &self.layout,
             Presence::Required,
@@ -83,6 +94,9 @@ impl SceneCache {
         )?;
         if let Some(error) = size_mismatch(scene, planes.width, planes.height) {
             return Err(error);
+        }
+        if self.reference_filter {
+            filter_reference(&mut planes);
         }
         let planes = Arc::new(planes);
         lock(&self.kept).keep(index, &planes, self.budget);

@@ -63,6 +63,8 @@ pub struct DataConfig {
     pub validation: f64,
     /// Augmentation: `true` (all), `false` or a list of `"flip"`, `"transpose"`, `"rgb"` and `"exposure"`.
     pub augment: Augment,
+    /// Filter the training scenes' references ([`crate::reference_filter`]): for references with visible noise.
+    pub reference_filter: bool,
     /// Memory for decoded scenes, in MiB, at most 2^24.
     pub cache_mib: usize,
     /// Threads that decode and cut batches; the batches do not depend on it.
@@ -82,6 +84,7 @@ impl Default for DataConfig {
             batch_size: BATCH_SIZE,
             validation: VALIDATION,
             augment: Augment::default(),
+            reference_filter: false,
             cache_mib: CACHE_MIB,
             workers: WORKERS,
         }

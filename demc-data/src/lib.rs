@@ -30,6 +30,7 @@ pub mod layout;
 pub mod loader;
 pub mod patch;
 pub mod plane;
+pub mod reference_filter;
 mod seed;
 pub mod stats;
 pub mod transform;

@@ -269,6 +269,24 @@ fn batches_do_not_depend_on_the_cache() {
 }
 
 #[test]
+fn the_reference_filter_changes_references_and_nothing_else() {
+    let filtering = DataConfig {
+        reference_filter: true,
+        ..small()
+    };
+    let (plain, filtered) = (load(&small(), 0, 3), load(&filtering, 0, 3));
+    for (plain, filtered) in plain.iter().zip(&filtered) {
+        assert_ne!(plain.reference_hdr, filtered.reference_hdr);
+        let reference_hdr = plain.reference_hdr.clone();
+        let same = Batch {
+            reference_hdr,
+            ..filtered.clone()
+        };
+        assert_eq!(plain, &same);
+    }
+}
+
+#[test]
 fn threads_that_want_one_scene_decode_it_once() {
     let cache = SceneCache::new(train_scenes(), layout(), usize::MAX);
     std::thread::scope(|scope| {
