@@ -59,7 +59,19 @@ pub struct Frame {
 /// [`Error::Read`] and [`Error::Exr`] for a file that cannot be decoded, [`Error::MissingChannels`],
 /// [`Error::Sizes`] and [`Error::NonFinite`] for buffers that cannot be used.
 pub fn read_frame(path: &Path, layout: &ChannelLayout) -> Result<Frame, Error> {
-    let planes = FramePlanes::read(path, layout, Presence::IfThere, Presence::IfThere)?;
+    read(path, layout, Presence::IfThere)
+}
+
+/// The same without the reference: what denoising needs.
+///
+/// # Errors
+/// As [`read_frame`].
+pub fn read_input(path: &Path, layout: &ChannelLayout) -> Result<Frame, Error> {
+    read(path, layout, Presence::Skip)
+}
+
+fn read(path: &Path, layout: &ChannelLayout, reference: Presence) -> Result<Frame, Error> {
+    let planes = FramePlanes::read(path, layout, reference, Presence::IfThere)?;
     let name = path
         .file_stem()
         .unwrap_or_default()

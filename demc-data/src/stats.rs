@@ -7,6 +7,8 @@ use std::thread;
 
 use crate::dataset::size_mismatch;
 use crate::frame::{FEATURES, FramePlanes, Presence};
+use crate::plane::Plane;
+use crate::ranges::{Ranges, Summary};
 use crate::transform::STD_FLOOR;
 use crate::{ChannelLayout, Error, FeatureStats, Normalizer, Scene};
 
@@ -23,6 +25,8 @@ const RELMSE_EPSILON: f64 = 0.001;
 pub struct Statistics {
     /// Gamma, feature statistics and flat colour: what the network's input and start need.
     pub normalizer: Normalizer,
+    /// What the scenes were like, one by one.
+    pub ranges: Ranges,
     /// Pixels of all scenes.
     pub pixels: u64,
     /// Pixels that no camera ray of theirs hit a surface from (`mask` = 0).
@@ -67,8 +71,11 @@ impl Statistics {
             joined.collect::<Result<_, Error>>()
         })?;
         let mut total = Sums::default();
+        let mut summaries = Vec::with_capacity(scenes.len());
         for index in 0..scenes.len() {
-            total.add(&shares[index % threads][index / threads]);
+            let share = &shares[index % threads][index / threads];
+            total.add(share);
+            summaries.extend(share.summary.clone());
         }
         Ok(Self {
             normalizer: Normalizer {
@@ -83,6 +90,7 @@ impl Statistics {
                     .color
                     .map(|channel| channel.best().powf(1.0 / f64::from(gamma)) as f32),
             },
+            ranges: Ranges::of(&summaries),
             pixels: total.pixels,
             misses: total.misses,
             clamped: total.clamped,
@@ -95,6 +103,8 @@ impl Statistics {
 struct Sums {
     features: [Moments; FEATURES],
     color: [FlatColor; 3],
+    /// Of one scene; none in a total.
+    summary: Option<Summary>,
     pixels: u64,
     misses: u64,
     clamped: u64,
@@ -108,24 +118,20 @@ impl Sums {
             return Err(error);
         }
         let pixels = planes.width * planes.height;
-        let hit: Vec<bool> = match &planes.mask {
-            Some(mask) => mask.to_f32().into_iter().map(|share| share > 0.0).collect(),
-            None => vec![true; pixels],
-        };
+        let mask = planes.mask.as_ref().map(Plane::to_f32);
+        let misses = mask.iter().flatten().filter(|share| **share <= 0.0);
         let mut sums = Self {
             pixels: pixels as u64,
+            misses: misses.count() as u64,
             clamped: planes.clamped as u64,
             ..Self::default()
         };
-        sums.misses = hit.iter().filter(|hit| !**hit).count() as u64;
         for (channel, plane) in planes.features.iter().enumerate() {
-            let mut samples = plane.to_f32();
-            if channel < GEOMETRY {
-                let mut hit = hit.iter();
-                samples.retain(|_| *hit.next().expect("a mask has as many samples as a feature"));
-            }
+            let samples = hit_samples(channel, plane.to_f32(), mask.as_deref());
             sums.features[channel] = Moments::of(&samples);
         }
+        let color: Vec<f32> = planes.color.iter().flat_map(Plane::to_f32).collect();
+        sums.summary = Some(Summary::new(&color, &sums.features));
         for (color, plane) in sums.color.iter_mut().zip(planes.reference.iter().flatten()) {
             *color = FlatColor::of(&plane.to_f32());
         }
@@ -146,17 +152,26 @@ impl Sums {
     }
 }
 
+/// The samples of a feature channel that count: of normals and positions those where something was hit.
+pub(crate) fn hit_samples(channel: usize, mut samples: Vec<f32>, mask: Option<&[f32]>) -> Vec<f32> {
+    if let Some(mask) = mask.filter(|_| channel < GEOMETRY) {
+        let mut mask = mask.iter();
+        samples.retain(|_| mask.next().is_some_and(|share| *share > 0.0));
+    }
+    samples
+}
+
 /// Count, mean and sum of squared distances from the mean.
 #[derive(Debug, Default, Clone, Copy)]
-struct Moments {
+pub(crate) struct Moments {
     count: f64,
-    mean: f64,
+    pub(crate) mean: f64,
     squares: f64,
 }
 
 impl Moments {
     /// In two passes: positions far from the origin lose no digits.
-    fn of(samples: &[f32]) -> Self {
+    pub(crate) fn of(samples: &[f32]) -> Self {
         let count = samples.len() as f64;
         let mean = samples.iter().map(|&sample| f64::from(sample)).sum::<f64>() / count.max(1.0);
         let squares = samples
@@ -181,7 +196,7 @@ impl Moments {
         }
     }
 
-    fn std(&self) -> f64 {
+    pub(crate) fn std(&self) -> f64 {
         (self.squares / self.count.max(1.0)).sqrt()
     }
 }

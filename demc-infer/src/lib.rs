@@ -11,12 +11,15 @@ pub mod compute;
 pub mod denoise;
 pub mod device;
 pub mod evaluate;
+pub mod guard;
 pub mod memory;
 pub mod padding;
 pub mod picture;
+pub mod tiles;
 
 pub use bundle::{Bundle, BundleError, BundleFile, BundleMeta, Names, Precision};
-pub use denoise::DenoiseError;
+pub use denoise::{DenoiseError, Denoised};
 pub use device::DeviceError;
 pub use evaluate::{ImageScore, Report, Score};
 pub use picture::Picture;
+pub use tiles::{Tiles, Tiling};

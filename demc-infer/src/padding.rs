@@ -4,7 +4,11 @@
 //! The image grows to the right and downwards by repeating its last column and row, which leaves no edge that the
 //! network could take for one of the scene (ours: the paper trains and tests on sizes that divide).
 
+use std::ops::Range;
+
 use demc_model::DOWNSAMPLING;
+
+use crate::tiles::Span;
 
 /// The sizes of an image before and after padding, in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -34,20 +38,49 @@ impl Padding {
     /// # Panics
     /// When `planes` does not hold whole planes of at least one pixel.
     pub fn pad(&self, planes: &[f32]) -> Vec<f32> {
+        self.cut(planes, 0..self.padded_height(), 0..self.padded_width())
+    }
+
+    /// A part of the padded planes, without padding the rest.
+    ///
+    /// # Shapes
+    /// `[C, H, W]` -> `[C, rows, columns]`
+    ///
+    /// # Panics
+    /// When `planes` does not hold whole planes of at least one pixel.
+    pub fn cut(&self, planes: &[f32], rows: Range<usize>, columns: Range<usize>) -> Vec<f32> {
         let Self { height, width } = *self;
-        let (padded_height, padded_width) = (self.padded_height(), self.padded_width());
         assert!(height > 0 && width > 0 && planes.len().is_multiple_of(height * width));
         let channels = planes.len() / (height * width);
-        let mut padded = Vec::with_capacity(channels * padded_height * padded_width);
+        let inside = columns.start.min(width)..columns.end.min(width);
+        let beyond = columns.len() - inside.len();
+        let mut part = Vec::with_capacity(channels * rows.len() * columns.len());
         for plane in planes.chunks_exact(height * width) {
-            for y in 0..padded_height {
-                let start = y.min(height - 1) * width;
-                let row = &plane[start..start + width];
-                padded.extend_from_slice(row);
-                padded.extend(std::iter::repeat_n(row[width - 1], padded_width - width));
+            for y in rows.clone() {
+                let row = &plane[y.min(height - 1) * width..][..width];
+                part.extend_from_slice(&row[inside.clone()]);
+                part.extend(std::iter::repeat_n(row[width - 1], beyond));
             }
         }
-        padded
+        part
+    }
+
+    /// Puts a tile's core in its place, as far as it lies on the image.
+    ///
+    /// # Shapes
+    /// `tile` is `[C, rows.read, columns.read]`, `planes` `[C, H, W]`.
+    pub fn paste(&self, tile: &[f32], rows: &Span, columns: &Span, planes: &mut [f32]) {
+        let Self { height, width } = *self;
+        let (tall, wide) = (rows.read.len(), columns.read.len());
+        let kept = columns.core.start..columns.core.end.min(width);
+        let tiles = tile.chunks_exact(tall * wide);
+        for (plane, tile) in planes.chunks_exact_mut(height * width).zip(tiles) {
+            for y in rows.core.start..rows.core.end.min(height) {
+                let row = &tile[(y - rows.read.start) * wide..][..wide];
+                let from = kept.start - columns.read.start;
+                plane[y * width..][kept.clone()].copy_from_slice(&row[from..][..kept.len()]);
+            }
+        }
     }
 
     /// Cuts the image out of every padded plane: the inverse of [`pad`](Self::pad).
@@ -107,5 +140,43 @@ mod tests {
         assert_eq!(&padded[..6], &[1.0, 2.0, 3.0, 3.0, 3.0, 3.0]);
         assert_eq!(&padded[31 * 32..31 * 32 + 4], &[4.0, 5.0, 6.0, 6.0]);
         assert_eq!(padded[32 * 32 - 1], 6.0);
+    }
+
+    #[test]
+    fn a_part_is_the_part_of_the_padded_image() {
+        let padding = Padding {
+            height: 40,
+            width: 50,
+        };
+        let planes = pattern(2, 40, 50);
+        let padded = padding.pad(&planes);
+        let part = padding.cut(&planes, 32..64, 10..60);
+        for channel in 0..2 {
+            for y in 0..32 {
+                for x in 0..50 {
+                    let expected = padded[(channel * 64 + y + 32) * 64 + x + 10];
+                    assert_eq!(part[(channel * 32 + y) * 50 + x], expected);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn tiles_cut_and_pasted_are_the_image() {
+        let (height, width) = (70, 100);
+        let padding = Padding { height, width };
+        let planes = pattern(3, height, width);
+        let span = |core: Range<usize>, end: usize| Span {
+            read: core.start.saturating_sub(32)..(core.end + 32).min(end),
+            core,
+        };
+        let mut out = vec![f32::NAN; planes.len()];
+        for rows in [span(0..64, 96), span(64..96, 96)] {
+            for columns in [span(0..32, 128), span(32..96, 128), span(96..128, 128)] {
+                let tile = padding.cut(&planes, rows.read.clone(), columns.read.clone());
+                padding.paste(&tile, &rows, &columns, &mut out);
+            }
+        }
+        assert_eq!(out, planes);
     }
 }

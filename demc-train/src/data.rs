@@ -2,7 +2,7 @@
 
 use anyhow::Context;
 use demc_data::{
-    ChannelLayout, DataConfig, Dataset, Normalizer, Scene, Split, Statistics, read_frame,
+    ChannelLayout, DataConfig, Dataset, Normalizer, Ranges, Scene, Split, Statistics, read_frame,
 };
 
 /// A data set, opened, split and measured.
@@ -18,6 +18,8 @@ pub struct Data {
     pub test: Vec<Scene>,
     /// Gamma and the statistics of [`Self::train`].
     pub normalizer: Normalizer,
+    /// What each of [`Self::train`] was like.
+    pub ranges: Ranges,
     /// Negative values of colour and reference that count as 0.
     pub clamped: u64,
 }
@@ -54,6 +56,7 @@ impl Data {
             validation,
             test,
             normalizer: statistics.normalizer,
+            ranges: statistics.ranges,
             clamped,
         })
     }

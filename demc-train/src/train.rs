@@ -83,8 +83,7 @@ impl Run {
                 adam,
                 state,
             }) => {
-                let (normalizer, layout) = (data.normalizer.clone(), data.layout.clone());
-                let expected = BundleMeta::new(config.model, normalizer, layout, state.step);
+                let expected = meta(&config, &data, state.step);
                 ensure!(
                     bundle.meta == expected,
                     "{}: the checkpoint has another network, layout or statistics than this run",
@@ -359,12 +358,7 @@ impl Run {
 
     /// A network of this run as it stands, with all that belongs to it.
     fn bundle_of(&self, model: Denoiser) -> Bundle {
-        let meta = BundleMeta::new(
-            self.config.model,
-            self.data.normalizer.clone(),
-            self.data.layout.clone(),
-            self.state.step,
-        );
+        let meta = meta(&self.config, &self.data, self.state.step);
         Bundle { meta, model }
     }
 
@@ -391,4 +385,10 @@ impl Run {
             .write("test.json", &serde_json::to_vec_pretty(&report)?)?;
         Ok(Some((bundle.meta.step, report)))
     }
+}
+
+/// What belongs to the weights of `step`.
+fn meta(config: &Config, data: &Data, step: u64) -> BundleMeta {
+    let (normalizer, layout) = (data.normalizer.clone(), data.layout.clone());
+    BundleMeta::new(config.model, normalizer, layout, step).with_ranges(data.ranges.clone())
 }

@@ -18,7 +18,7 @@ use std::io::Write;
 use std::path::Path;
 
 use burn::tensor::Device;
-use demc_data::{ChannelLayout, Normalizer};
+use demc_data::{ChannelLayout, Normalizer, Ranges};
 use demc_model::{Denoiser, ModelConfig, Weights};
 use serde::{Deserialize, Serialize};
 
@@ -42,6 +42,10 @@ pub struct BundleMeta {
     pub layout: ChannelLayout,
     /// Optimizer steps that the weights have seen.
     pub step: u64,
+    /// What the training scenes were like, one by one; none in a bundle from elsewhere. The network does not need it,
+    /// [`guard`](crate::guard) does.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ranges: Option<Ranges>,
 }
 
 impl BundleMeta {
@@ -58,6 +62,15 @@ impl BundleMeta {
             normalizer,
             layout,
             step,
+            ranges: None,
+        }
+    }
+
+    /// The same with what the training scenes were like.
+    pub fn with_ranges(self, ranges: Ranges) -> Self {
+        Self {
+            ranges: Some(ranges),
+            ..self
         }
     }
 }

@@ -3,10 +3,15 @@
 //! Results go to stdout, progress and errors to stderr. Exit code 0: done; 1: the run, or a file of it, failed; 2: the
 //! command line asks for something that cannot be.
 
+mod check;
+mod cost;
 mod denoise;
 mod evaluate;
 mod export;
+mod inputs;
 mod inspect;
+mod jobs;
+mod tiling;
 
 use std::path::{Path, PathBuf};
 
@@ -29,6 +34,8 @@ pub struct Arguments {
 #[derive(Subcommand)]
 enum Command {
     Denoise(denoise::Denoise),
+    Cost(cost::Cost),
+    Check(check::Check),
     Evaluate(evaluate::Evaluate),
     Export(export::Export),
     Inspect(inspect::Inspect),
@@ -43,6 +50,8 @@ pub struct Usage(String);
 pub fn run(arguments: Arguments) -> anyhow::Result<()> {
     match arguments.command {
         Command::Denoise(command) => command.run(),
+        Command::Cost(command) => command.run(),
+        Command::Check(command) => command.run(),
         Command::Evaluate(command) => command.run(),
         Command::Export(command) => command.run(),
         Command::Inspect(command) => command.run(),

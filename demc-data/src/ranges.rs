@@ -1,0 +1,144 @@
+//! What the training scenes were like, scene by scene: so that an image that is unlike all of them can be told so.
+
+use serde::{Deserialize, Serialize};
+
+use crate::frame::{FEATURES, Frame};
+use crate::stats::{Moments, hit_samples};
+
+/// Rec. 709 luminance of red, green and blue.
+const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
+/// Exponent of the mean that stands for an image's exposure: dark pixels count, a firefly hardly does (ours).
+const EXPOSURE_GAMMA: f64 = 2.2;
+/// Share of the training scenes that lie below and above a range (ours).
+const TAIL: f64 = 0.05;
+
+/// One image in a few numbers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Summary {
+    /// `mean(luminance^(1/2.2))^2.2` of the noisy colour, linear HDR.
+    pub exposure: f64,
+    /// Mean of each feature channel; of normals and positions where something was hit.
+    pub mean: [f64; FEATURES],
+    /// Standard deviation of each feature channel, likewise.
+    pub std: [f64; FEATURES],
+}
+
+impl Summary {
+    /// The summary of a frame.
+    pub fn of(frame: &Frame) -> Self {
+        let pixels = frame.width * frame.height;
+        let mut planes = frame.features.chunks_exact(pixels.max(1));
+        let features = std::array::from_fn(|channel| {
+            let plane = planes.next().unwrap_or_default().to_vec();
+            Moments::of(&hit_samples(channel, plane, frame.mask.as_deref()))
+        });
+        Self::new(&frame.color, &features)
+    }
+
+    /// From the noisy colour, planar `[3, N]`, and the moments of the features.
+    pub(crate) fn new(color_hdr: &[f32], features: &[Moments; FEATURES]) -> Self {
+        let pixels = color_hdr.len() / 3;
+        let compressed: f64 = (0..pixels)
+            .map(|i| {
+                let channels = LUMINANCE.iter().enumerate();
+                let luminance: f32 = channels.map(|(c, y)| y * color_hdr[c * pixels + i]).sum();
+                f64::from(luminance.max(0.0)).powf(1.0 / EXPOSURE_GAMMA)
+            })
+            .sum();
+        Self {
+            exposure: (compressed / pixels.max(1) as f64).powf(EXPOSURE_GAMMA),
+            mean: features.map(|moments| moments.mean),
+            std: features.map(|moments| moments.std()),
+        }
+    }
+}
+
+/// The least and the most of some scenes, 5 % of them left out at either end.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Range {
+    /// 5 % of the scenes are below.
+    pub low: f32,
+    /// 5 % of the scenes are above.
+    pub high: f32,
+}
+
+impl Range {
+    /// The range of `values`; from 0 to 0 if there are none.
+    fn of(mut values: Vec<f64>) -> Self {
+        values.sort_by(f64::total_cmp);
+        let last = values.len().saturating_sub(1) as f64;
+        let at = |share: f64| *values.get((share * last).round() as usize).unwrap_or(&0.0) as f32;
+        Self {
+            low: at(TAIL),
+            high: at(1.0 - TAIL),
+        }
+    }
+}
+
+/// Where the summaries of the training scenes lie.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Ranges {
+    /// Of [`Summary::exposure`].
+    pub exposure: Range,
+    /// Of [`Summary::mean`], channel by channel.
+    pub mean: [Range; FEATURES],
+    /// Of [`Summary::std`], channel by channel.
+    pub std: [Range; FEATURES],
+}
+
+impl Ranges {
+    /// The ranges of these scenes.
+    pub fn of(scenes: &[Summary]) -> Self {
+        let range = |value: &dyn Fn(&Summary) -> f64| Range::of(scenes.iter().map(value).collect());
+        Self {
+            exposure: range(&|scene| scene.exposure),
+            mean: std::array::from_fn(|channel| range(&|scene| scene.mean[channel])),
+            std: std::array::from_fn(|channel| range(&|scene| scene.std[channel])),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame(color: f32, feature: f32) -> Frame {
+        Frame {
+            name: "flat".into(),
+            width: 4,
+            height: 2,
+            color: vec![color; 24],
+            features: (0..12 * 8).map(|i| feature + (i % 2) as f32).collect(),
+            reference: None,
+            mask: None,
+            clamped: 0,
+        }
+    }
+
+    #[test]
+    fn a_flat_image_has_its_own_exposure_and_moments() {
+        let summary = Summary::of(&frame(0.25, 3.0));
+        assert!((summary.exposure - 0.25).abs() < 1e-6);
+        assert_eq!((summary.mean[3], summary.std[3]), (3.5, 0.5));
+    }
+
+    #[test]
+    fn misses_do_not_count_for_geometry() {
+        let mut frame = frame(0.25, 3.0);
+        frame.mask = Some([1.0, 0.0].repeat(4));
+        let summary = Summary::of(&frame);
+        assert_eq!((summary.mean[5], summary.std[5]), (3.0, 0.0));
+        assert_eq!((summary.mean[6], summary.std[6]), (3.5, 0.5));
+    }
+
+    #[test]
+    fn a_range_leaves_a_twentieth_out_at_either_end() {
+        let range = Range::of((0..=100).rev().map(f64::from).collect());
+        let (low, high) = (5.0, 95.0);
+        assert_eq!(range, Range { low, high });
+        let only = Range::of(vec![2.0]);
+        assert_eq!((only.low, only.high), (2.0, 2.0));
+    }
+}

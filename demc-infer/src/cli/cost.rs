@@ -1,0 +1,182 @@
+//! `demc-infer cost`: what denoising takes, before it is done.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use demc_data::frame::{Presence, check_header};
+use demc_infer::{Bundle, Tiling, memory};
+use demc_model::DOWNSAMPLING;
+use serde::Serialize;
+
+use super::tiling::{TilingFlags, describe};
+use super::{DeviceFlag, Model, print};
+
+/// What denoising an image takes: parameters, operations, memory, tiles. Nothing is denoised.
+#[derive(Args)]
+#[command(after_help = "Examples:
+  demc-infer cost --size 1280x720
+  demc-infer cost --model runs/demc --size 7680x4320 --memory 6000
+  demc-infer cost --json noisy.exr | jq .images[0].tiles")]
+pub struct Cost {
+    #[command(flatten)]
+    model: Model,
+    /// Images, of which the header is read
+    #[arg(value_name = "IN.exr", required_unless_present = "sizes")]
+    inputs: Vec<PathBuf>,
+    /// Sizes in pixels
+    #[arg(long = "size", value_name = "WxH", value_parser = size)]
+    sizes: Vec<(usize, usize)>,
+    #[command(flatten)]
+    tiling: TilingFlags,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    device: DeviceFlag,
+}
+
+/// Longest side that is asked about, in pixels: a longer one is a slip.
+const MAX_SIDE: usize = 1 << 17;
+
+/// `1280x720`.
+fn size(text: &str) -> Result<(usize, usize), String> {
+    let side = |text: &str| {
+        let side = text.parse().ok();
+        side.filter(|side| (1..=MAX_SIDE).contains(side))
+    };
+    let sides = text
+        .split_once(['x', 'X'])
+        .and_then(|(w, h)| Some((side(w)?, side(h)?)));
+    sides.ok_or_else(|| format!("not WIDTHxHEIGHT with sides from 1 to {MAX_SIDE}"))
+}
+
+#[derive(Serialize)]
+struct Report {
+    variant: &'static str,
+    reading: &'static str,
+    width: usize,
+    parameters: u64,
+    /// Of the weights in memory.
+    weight_bytes: u64,
+    /// What is free for a pass; none where nobody tells.
+    available_bytes: Option<u64>,
+    images: Vec<Image>,
+}
+
+#[derive(Serialize)]
+struct Image {
+    width: usize,
+    height: usize,
+    /// Floating-point operations, halos and padding included; a multiplication and an addition count as two.
+    flops: f64,
+    /// Operations without halos.
+    flops_whole: f64,
+    /// What a pass over the largest tile takes beside weights and images.
+    pass_bytes: u64,
+    /// What the image takes, as 32-bit floats: colour, features, output.
+    image_bytes: u64,
+    tiles: usize,
+    largest_tile: [usize; 2],
+    #[serde(skip)]
+    plan: String,
+}
+
+impl Cost {
+    /// Prints the costs of every size.
+    pub fn run(self) -> anyhow::Result<()> {
+        let bundle = self.model.load_onto(&self.device)?;
+        let tiling = self.tiling.tiling();
+        let mut sizes = self.sizes;
+        for input in &self.inputs {
+            let window = check_header(input, &bundle.meta.layout, Presence::Skip)?;
+            sizes.push((window.width, window.height));
+        }
+        let config = bundle.model.config();
+        let parameters = config.parameter_count();
+        let images = sizes
+            .into_iter()
+            .map(|(width, height)| image(&bundle, &tiling, width, height));
+        let report = Report {
+            variant: config.variant.spec().name,
+            reading: config.reading.spec().name,
+            width: config.width,
+            parameters,
+            weight_bytes: parameters * size_of::<f32>() as u64,
+            available_bytes: tiling.memory.or_else(|| bundle.memory_budget()),
+            images: images.collect::<Result<_, _>>()?,
+        };
+        print(&match self.json {
+            true => serde_json::to_string_pretty(&report)?,
+            false => report.text(),
+        })
+    }
+}
+
+fn image(
+    bundle: &Bundle,
+    tiling: &Tiling,
+    width: usize,
+    height: usize,
+) -> Result<Image, memory::TooLarge> {
+    let tiles = bundle.tiles(height, width, tiling)?;
+    let config = bundle.model.config();
+    let (tall, wide) = tiles.largest();
+    let padded = height.next_multiple_of(DOWNSAMPLING) * width.next_multiple_of(DOWNSAMPLING);
+    Ok(Image {
+        width,
+        height,
+        flops: config.flops_per_pixel() * tiles.computed_pixels() as f64,
+        flops_whole: config.flops_per_pixel() * padded as f64,
+        pass_bytes: bundle.pass_bytes(tall, wide),
+        image_bytes: (width * height * (3 + 12 + 3) * size_of::<f32>()) as u64,
+        tiles: tiles.count(),
+        largest_tile: [wide, tall],
+        plan: describe(&tiles, tiling),
+    })
+}
+
+impl Report {
+    fn text(&self) -> String {
+        let mib = |bytes: u64| bytes.div_ceil(1 << 20);
+        let mut lines = vec![
+            format!(
+                "network     {}, {} reading, width {}",
+                self.variant, self.reading, self.width
+            ),
+            format!(
+                "parameters  {}, {} MiB",
+                self.parameters,
+                mib(self.weight_bytes)
+            ),
+            match self.available_bytes {
+                Some(bytes) => format!("available   {} MiB", mib(bytes)),
+                None => "available   unknown".into(),
+            },
+        ];
+        for image in &self.images {
+            let Image { width, height, .. } = image;
+            lines.push(format!(
+                "\n{width}x{height}\n  operations  {:.1} GFLOP ({:.1} without halos)\n  memory      {} MiB for a pass, {} MiB for the image and its features\n  tiles       {}",
+                image.flops / 1e9,
+                image.flops_whole / 1e9,
+                mib(image.pass_bytes),
+                mib(image.image_bytes),
+                image.plan
+            ));
+        }
+        lines.join("\n")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_size_is_two_numbers() {
+        assert_eq!(size("1280x720"), Ok((1280, 720)));
+        for wrong in ["1280", "0x5", "5x", "axb", "1x2x3", "999999x2"] {
+            assert!(size(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,286 @@
+//! Which files a command line means: files, directories, patterns, frame sequences.
+
+use std::ffi::OsStr;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use super::Usage;
+
+/// Frame numbers, first to last: `7` or `1-240`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Frames {
+    first: u64,
+    last: u64,
+}
+
+impl FromStr for Frames {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (first, last) = text.split_once('-').unwrap_or((text, text));
+        let number = |text: &str| text.parse().map_err(|_| "not N or FIRST-LAST".to_owned());
+        let (first, last) = (number(first)?, number(last)?);
+        match first <= last {
+            true => Ok(Self { first, last }),
+            false => Err(format!("{first} is after {last}")),
+        }
+    }
+}
+
+/// The images of a command line.
+#[derive(Debug)]
+pub struct Inputs {
+    /// In their order.
+    pub files: Vec<PathBuf>,
+    /// Whether there are, or could have been, several.
+    pub several: bool,
+}
+
+impl Inputs {
+    /// What `arguments` mean: a file is itself, a directory its `*.exr`, `shot.####.exr` or `shot.%04d.exr` the frames of a
+    /// sequence, `*`, `?` and `[..]` a pattern where no file has such a name.
+    ///
+    /// # Errors
+    /// A directory, a pattern or a sequence without a single file; `frames` without a sequence.
+    pub fn expand(arguments: &[PathBuf], frames: Option<Frames>) -> Result<Self, Usage> {
+        let mut files = Vec::new();
+        let mut several = arguments.len() > 1;
+        let mut sequences = 0;
+        for argument in arguments {
+            let found = if argument.is_file() {
+                vec![argument.clone()]
+            } else if argument.is_dir() {
+                several = true;
+                directory(argument)?
+            } else if let Some(sequence) = Sequence::parse(argument) {
+                several = true;
+                sequences += 1;
+                sequence.files(frames)?
+            } else if is_pattern(argument) {
+                several = true;
+                pattern(argument)?
+            } else {
+                // Reading it says best what is wrong with it.
+                vec![argument.clone()]
+            };
+            if found.is_empty() {
+                return Err(Usage(format!("{}: no image there", argument.display())));
+            }
+            files.extend(found);
+        }
+        if frames.is_some() && sequences == 0 {
+            let message = "--frames needs a sequence among the inputs, such as shot.####.exr";
+            return Err(Usage(message.into()));
+        }
+        Ok(Self { files, several })
+    }
+}
+
+/// The EXR files directly in `path`, by name.
+fn directory(path: &Path) -> Result<Vec<PathBuf>, Usage> {
+    let mut files: Vec<PathBuf> = entries(path)?
+        .into_iter()
+        .filter(|file| is_exr(file) && file.is_file())
+        .collect();
+    files.sort();
+    Ok(files)
+}
+
+fn entries(path: &Path) -> Result<Vec<PathBuf>, Usage> {
+    let error = |error| Usage(format!("{}: {error}", path.display()));
+    let entries = fs::read_dir(path).map_err(error)?;
+    let paths = entries.map(|entry| entry.map(|entry| entry.path()));
+    paths.collect::<Result<_, _>>().map_err(error)
+}
+
+fn is_exr(path: &Path) -> bool {
+    let extension = path.extension().and_then(OsStr::to_str);
+    extension.is_some_and(|extension| extension.eq_ignore_ascii_case("exr"))
+}
+
+fn is_pattern(path: &Path) -> bool {
+    path.to_string_lossy().contains(['*', '?', '['])
+}
+
+/// The files that a pattern finds, by name.
+fn pattern(argument: &Path) -> Result<Vec<PathBuf>, Usage> {
+    let error = |error: &dyn std::fmt::Display| Usage(format!("{}: {error}", argument.display()));
+    let found = glob::glob(&argument.to_string_lossy()).map_err(|source| error(&source))?;
+    let mut files = Vec::new();
+    for path in found {
+        let path = path.map_err(|source| error(&source))?;
+        if path.is_file() {
+            files.push(path);
+        }
+    }
+    Ok(files)
+}
+
+/// `directory/PREFIX####SUFFIX`.
+struct Sequence<'a> {
+    argument: &'a Path,
+    prefix: String,
+    /// Digits of a frame number, leading zeros included.
+    digits: usize,
+    suffix: String,
+}
+
+impl<'a> Sequence<'a> {
+    /// A file name with `#`s or a `%0Nd` in it.
+    fn parse(argument: &'a Path) -> Option<Self> {
+        let name = argument.file_name()?.to_str()?;
+        let (start, end, digits) = hashes(name).or_else(|| percent(name))?;
+        Some(Self {
+            argument,
+            prefix: name[..start].to_owned(),
+            digits,
+            suffix: name[end..].to_owned(),
+        })
+    }
+
+    /// The frames that are there, by number; of those between `frames`, where given.
+    fn files(&self, frames: Option<Frames>) -> Result<Vec<PathBuf>, Usage> {
+        let parent = match self.argument.parent() {
+            Some(parent) if parent != Path::new("") => parent,
+            _ => Path::new("."),
+        };
+        let mut found: Vec<(u64, PathBuf)> = entries(parent)?
+            .into_iter()
+            .filter_map(|path| Some((self.number(path.file_name()?.to_str()?)?, path)))
+            .filter(|(number, _)| {
+                frames.is_none_or(|frames| (frames.first..=frames.last).contains(number))
+            })
+            .collect();
+        found.sort();
+        if let Some(missing) = missing(&found, frames) {
+            eprintln!("note: {}: {missing}", self.argument.display());
+        }
+        Ok(found.into_iter().map(|(_, path)| path).collect())
+    }
+
+    /// The number of the frame of this name: as many digits, or more without a leading zero.
+    fn number(&self, name: &str) -> Option<u64> {
+        let digits = name
+            .strip_prefix(&self.prefix)?
+            .strip_suffix(&self.suffix)?;
+        let fits =
+            digits.len() == self.digits || digits.len() > self.digits && !digits.starts_with('0');
+        let all_digits = digits.bytes().all(|byte| byte.is_ascii_digit());
+        (fits && all_digits).then(|| digits.parse().ok()).flatten()
+    }
+}
+
+/// The first run of `#`: start, end, length.
+fn hashes(name: &str) -> Option<(usize, usize, usize)> {
+    let start = name.find('#')?;
+    let digits = name[start..]
+        .bytes()
+        .take_while(|byte| *byte == b'#')
+        .count();
+    Some((start, start + digits, digits))
+}
+
+/// `%d`, `%4d` or `%04d`: start, end, digits.
+fn percent(name: &str) -> Option<(usize, usize, usize)> {
+    let start = name.find('%')?;
+    let length = name[start + 1..].find(|c: char| !c.is_ascii_digit())?;
+    let width = &name[start + 1..][..length];
+    let end = start + 1 + length + 1;
+    (name[..end].ends_with('d')).then(|| (start, end, width.parse().unwrap_or(1)))
+}
+
+/// How many frames are missing between the first and the last.
+fn missing(found: &[(u64, PathBuf)], frames: Option<Frames>) -> Option<String> {
+    let first = frames.map_or(found.first()?.0, |frames| frames.first);
+    let last = frames.map_or(found.last()?.0, |frames| frames.last);
+    let missing = (last - first + 1).saturating_sub(found.len() as u64);
+    (missing > 0).then(|| format!("{missing} of the frames {first} to {last} are missing"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A directory with these empty files.
+    fn directory_of(names: &[&str]) -> tempfile::TempDir {
+        let dir = tempfile::tempdir().expect("a directory");
+        for name in names {
+            fs::write(dir.path().join(name), "").expect("a file");
+        }
+        dir
+    }
+
+    fn names(dir: &tempfile::TempDir, argument: &str, frames: Option<&str>) -> Vec<String> {
+        let frames = frames.map(|text| text.parse().expect("frames"));
+        let found = Inputs::expand(&[dir.path().join(argument)], frames).expect("files");
+        let name = |path: &PathBuf| path.file_name().map(|name| name.to_string_lossy().into());
+        found.files.iter().filter_map(name).collect()
+    }
+
+    #[test]
+    fn a_directory_is_its_images_by_name() {
+        let dir = directory_of(&["b.exr", "a.EXR", "c.txt"]);
+        assert_eq!(names(&dir, "", None), ["a.EXR", "b.exr"]);
+    }
+
+    #[test]
+    fn a_sequence_is_its_frames_by_number() {
+        let dir = directory_of(&[
+            "s.0009.exr",
+            "s.0010.exr",
+            "s.12345.exr",
+            "s.010.exr",
+            "s.00011.exr",
+            "s.abcd.exr",
+            "t.0001.exr",
+        ]);
+        for pattern in ["s.####.exr", "s.%04d.exr"] {
+            let all = names(&dir, pattern, None);
+            assert_eq!(all, ["s.0009.exr", "s.0010.exr", "s.12345.exr"]);
+            assert_eq!(names(&dir, pattern, Some("10-99")), ["s.0010.exr"]);
+        }
+        assert_eq!(names(&dir, "s.%d.exr", None).len(), 3);
+    }
+
+    #[test]
+    fn a_pattern_finds_files_and_a_file_may_have_such_a_name() {
+        let dir = directory_of(&["a1.exr", "a2.exr", "b.exr"]);
+        assert_eq!(names(&dir, "a*.exr", None), ["a1.exr", "a2.exr"]);
+        assert_eq!(names(&dir, "[ab]?.exr", None), ["a1.exr", "a2.exr"]);
+        let odd = directory_of(&["x[1].exr", "x1.exr", "shot#1.exr"]);
+        assert_eq!(names(&odd, "x[1].exr", None), ["x[1].exr"]);
+        assert_eq!(names(&odd, "shot#1.exr", None), ["shot#1.exr"]);
+    }
+
+    #[test]
+    fn nothing_found_is_an_error_and_a_missing_file_is_not() {
+        let dir = directory_of(&["a.txt"]);
+        for argument in ["", "*.exr", "s.####.exr"] {
+            let error = Inputs::expand(&[dir.path().join(argument)], None).expect_err("nothing");
+            assert!(error.to_string().ends_with("no image there"), "{error}");
+        }
+        let absent = dir.path().join("absent.exr");
+        let found = Inputs::expand(std::slice::from_ref(&absent), None).expect("as it is");
+        assert_eq!((found.files, found.several), (vec![absent], false));
+        let error = Inputs::expand(&["a.exr".into()], "1-2".parse().ok()).expect_err("no sequence");
+        assert!(error.to_string().starts_with("--frames needs"), "{error}");
+    }
+
+    #[test]
+    fn frames_are_a_number_or_two() {
+        let frames = |text: &str| text.parse::<Frames>();
+        assert_eq!(frames("7"), frames("7-7"));
+        for wrong in ["", "a", "5-", "9-3", "1-2-3", "-4"] {
+            assert!(frames(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn gaps_are_counted() {
+        let found: Vec<_> = [3, 4, 7].map(|n| (n, PathBuf::new())).into();
+        let message = missing(&found, None).expect("a gap");
+        assert_eq!(message, "2 of the frames 3 to 7 are missing");
+        assert_eq!(missing(&found[..2], None), None);
+    }
+}

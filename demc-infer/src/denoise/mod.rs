@@ -1,0 +1,249 @@
+//! A frame to its denoised image: padding and tiles, gamma and Z-score, the network, back to linear HDR.
+
+mod error;
+mod seams;
+#[cfg(test)]
+mod tests;
+
+use burn::module::Module;
+use burn::tensor::{Device, Tensor, TensorData};
+use demc_data::{FEATURES, Frame};
+use demc_model::config::COLOR_CHANNELS;
+
+use crate::Bundle;
+use crate::memory;
+use crate::padding::Padding;
+use crate::tiles::{Tiles, Tiling};
+
+pub use error::DenoiseError;
+pub use seams::SeamError;
+
+/// A denoised image, and how it was made.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Denoised {
+    /// Planar `[3, H, W]`, linear HDR, not negative.
+    pub color_hdr: Vec<f32>,
+    /// How the image was cut.
+    pub tiles: Tiles,
+    /// What a halo that is too small costs, measured at seams; none where the tiles are exact or one.
+    pub seam_error: Option<SeamError>,
+}
+
+impl Bundle {
+    /// Denoises `frame`, whatever its size, as one image: whole where memory allows, else in tiles that equal it
+    /// ([`crate::tiles`]). It is padded by edge replication to multiples of 32, then cropped.
+    ///
+    /// # Shapes
+    /// Returns planar `[3, H, W]` in linear HDR, not negative.
+    ///
+    /// # Errors
+    /// As [`check_statistics`](Self::check_statistics); an image of which not even a tile fits into the memory that is there; a
+    /// device that fails, an output that is not finite.
+    pub fn denoise(&self, frame: &Frame) -> Result<Vec<f32>, DenoiseError> {
+        self.denoise_tiled(frame, &Tiling::default(), |_, _| ())
+            .map(|denoised| denoised.color_hdr)
+    }
+
+    /// The same, cut as `tiling` says; `progress` hears how many of how many tiles are done.
+    ///
+    /// # Errors
+    /// As [`denoise`](Self::denoise).
+    pub fn denoise_tiled(
+        &self,
+        frame: &Frame,
+        tiling: &Tiling,
+        progress: impl FnMut(usize, usize),
+    ) -> Result<Denoised, DenoiseError> {
+        let input = Input::new(self, frame)?;
+        self.check_statistics(frame)?;
+        let tiles = self
+            .tiles(frame.height, frame.width, tiling)
+            .map_err(|source| DenoiseError::Memory {
+                name: frame.name.clone(),
+                source,
+            })?;
+        let color_hdr = input.denoise(&tiles, progress)?;
+        let seam_error = match tiling.is_exact() {
+            true => None,
+            false => input.seam_error(&tiles, &color_hdr)?,
+        };
+        Ok(Denoised {
+            color_hdr,
+            tiles,
+            seam_error,
+        })
+    }
+
+    /// How [`denoise_tiled`](Self::denoise_tiled) would cut an image of `height` x `width` pixels now.
+    ///
+    /// # Errors
+    /// If not even the smallest tile fits into memory.
+    pub fn tiles(
+        &self,
+        height: usize,
+        width: usize,
+        tiling: &Tiling,
+    ) -> Result<Tiles, memory::TooLarge> {
+        let padding = Padding { height, width };
+        let padded = (padding.padded_height(), padding.padded_width());
+        let budget = tiling.memory.or_else(|| {
+            let output = (COLOR_CHANNELS * height * width * size_of::<f32>()) as u64;
+            Some(self.memory_budget()?.saturating_sub(output))
+        });
+        let need = |height, width| self.pass_bytes(height, width);
+        Tiles::plan(padded, tiling, need, budget)
+    }
+
+    /// Bytes that a pass over `height` x `width` pixels, multiples of 32, takes beside the network.
+    pub fn pass_bytes(&self, height: usize, width: usize) -> u64 {
+        let ops = self.model.ops().on(&self.device());
+        memory::pass_bytes(ops, self.model.config(), height, width)
+    }
+
+    /// Bytes that a pass may take now on the model's device; none where nothing is known.
+    pub fn memory_budget(&self) -> Option<u64> {
+        memory::budget(&self.device())
+    }
+
+    /// What the fusion sub-network makes of the frame's features (Fig. 2 e), to look at; `None` for a variant
+    /// without it.
+    ///
+    /// # Shapes
+    /// Planar `[3, H, W]`, not negative, without a unit.
+    ///
+    /// # Errors
+    /// As [`denoise`](Self::denoise).
+    pub fn detail_map(&self, frame: &Frame) -> Result<Option<Vec<f32>>, DenoiseError> {
+        let input = Input::new(self, frame)?;
+        let (height, width) = (input.padding.padded_height(), input.padding.padded_width());
+        let map = self.model.detail_map(input.features_z(0..height, 0..width));
+        let map = map.map(|map| input.read(map)).transpose()?;
+        Ok(map.map(|map| input.padding.crop(&map)))
+    }
+
+    /// Where the model is.
+    pub(crate) fn device(&self) -> Device {
+        let devices = self.model.devices();
+        devices.first().expect("every network has weights").clone()
+    }
+}
+
+/// A frame on its way into a network.
+struct Input<'a> {
+    bundle: &'a Bundle,
+    frame: &'a Frame,
+    padding: Padding,
+    device: Device,
+}
+
+/// Rows or columns of the padded image, in pixels.
+type Pixels = std::ops::Range<usize>;
+
+impl<'a> Input<'a> {
+    /// Of a frame whose buffers have its size.
+    fn new(bundle: &'a Bundle, frame: &'a Frame) -> Result<Self, DenoiseError> {
+        check_sizes(frame)?;
+        Ok(Self {
+            bundle,
+            frame,
+            padding: Padding {
+                height: frame.height,
+                width: frame.width,
+            },
+            device: bundle.device(),
+        })
+    }
+
+    /// Planar `[3, H, W]` in linear HDR, tile by tile.
+    fn denoise(
+        &self,
+        tiles: &Tiles,
+        mut progress: impl FnMut(usize, usize),
+    ) -> Result<Vec<f32>, DenoiseError> {
+        let mut out = vec![0.0; self.frame.color.len()];
+        let mut bad = 0;
+        for (done, (rows, columns)) in tiles.iter().enumerate() {
+            progress(done, tiles.count());
+            let tile = self.tile(&rows.read, &columns.read)?;
+            bad += tile.iter().filter(|x| !x.is_finite()).count();
+            self.padding.paste(&tile, rows, columns, &mut out);
+        }
+        match bad {
+            0 => Ok(out),
+            count => Err(DenoiseError::NonFinite {
+                name: self.frame.name.clone(),
+                count,
+            }),
+        }
+    }
+
+    /// One pass through the network: `[3, rows, columns]` in linear HDR, NaN where the network's output is.
+    fn tile(&self, rows: &Pixels, columns: &Pixels) -> Result<Vec<f32>, DenoiseError> {
+        let normalizer = &self.bundle.meta.normalizer;
+        let frame = self.frame;
+        let mut color = self
+            .padding
+            .cut(&frame.color, rows.clone(), columns.clone());
+        normalizer.color_gamma_from_hdr(&mut color);
+        let color_gamma = self.tensor::<COLOR_CHANNELS>(color, rows, columns);
+        let features_z = self.features_z(rows.clone(), columns.clone());
+        let out = self.bundle.model.forward(color_gamma, features_z);
+        let mut out = self.read(out)?;
+        // Going back to HDR would turn NaN into 0.
+        let nan: Vec<usize> = (0..out.len()).filter(|i| out[*i].is_nan()).collect();
+        normalizer.color_hdr_from_gamma(&mut out);
+        nan.into_iter().for_each(|i| out[i] = f32::NAN);
+        Ok(out)
+    }
+
+    /// Z-scored features, `[1, 12, rows, columns]`.
+    fn features_z(&self, rows: Pixels, columns: Pixels) -> Tensor<4> {
+        let mut planes = self
+            .padding
+            .cut(&self.frame.features, rows.clone(), columns.clone());
+        self.bundle.meta.normalizer.features_z_from_raw(&mut planes);
+        self.tensor::<FEATURES>(planes, &rows, &columns)
+    }
+
+    fn tensor<const CHANNELS: usize>(
+        &self,
+        planes: Vec<f32>,
+        rows: &Pixels,
+        columns: &Pixels,
+    ) -> Tensor<4> {
+        let shape = [1, CHANNELS, rows.len(), columns.len()];
+        Tensor::from_data(TensorData::new(planes, shape), &self.device)
+    }
+
+    fn read(&self, out: Tensor<4>) -> Result<Vec<f32>, DenoiseError> {
+        out.try_into_vec_as::<f32>()
+            .map_err(|source| DenoiseError::Device {
+                name: self.frame.name.clone(),
+                source,
+            })
+    }
+}
+
+/// Checks that the frame's buffers have its size.
+pub(crate) fn check_sizes(frame: &Frame) -> Result<(), DenoiseError> {
+    let Frame { width, height, .. } = *frame;
+    let checks = [
+        ("color", frame.color.len(), COLOR_CHANNELS),
+        ("features", frame.features.len(), FEATURES),
+    ];
+    let mask = frame.mask.as_ref().map(|mask| ("mask", mask.len(), 1));
+    for (buffer, found, channels) in checks.into_iter().chain(mask) {
+        let expected = channels * width * height;
+        if found != expected || expected == 0 {
+            return Err(DenoiseError::Size {
+                name: frame.name.clone(),
+                buffer,
+                found,
+                expected,
+                width,
+                height,
+            });
+        }
+    }
+    Ok(())
+}

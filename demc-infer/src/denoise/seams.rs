@@ -1,0 +1,96 @@
+//! What a halo below the exact one costs, measured where it shows: small windows at seams, denoised once more with the exact halo.
+
+use crate::padding::Padding;
+use crate::tiles::{EXACT_HALO, Span, Tiles};
+use demc_model::DOWNSAMPLING;
+use demc_model::metrics::rel_mse_image;
+
+use super::{DenoiseError, Input, Pixels};
+
+/// Side of a window in pixels, a multiple of 32.
+const WINDOW: usize = 64;
+
+/// Most windows: of a regular share of the seams.
+const WINDOWS: usize = 4;
+
+/// How far an image of tiles with a small halo is from the exact one, at its seams.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SeamError {
+    /// RelMSE (Eq. 5) of the windows' pixels, with the exact image as reference.
+    pub relmse: f64,
+    /// Largest difference of a value, as a share of the largest exact value of its window.
+    pub largest: f64,
+    /// Windows of 64x64 pixels that were compared.
+    pub windows: usize,
+}
+
+impl Input<'_> {
+    /// Denoises windows at some seams exactly and compares; none if there are no seams.
+    pub(super) fn seam_error(
+        &self,
+        tiles: &Tiles,
+        color_hdr: &[f32],
+    ) -> Result<Option<SeamError>, DenoiseError> {
+        let windows = windows(tiles, self.padding);
+        let mut error = SeamError {
+            relmse: 0.0,
+            largest: 0.0,
+            windows: windows.len(),
+        };
+        for (rows, columns) in &windows {
+            let tile = self.tile(&rows.read, &columns.read)?;
+            let image = |range: &Span, side: usize| range.core.start..range.core.end.min(side);
+            let (y, x) = (
+                image(rows, self.padding.height),
+                image(columns, self.padding.width),
+            );
+            let within = Padding {
+                height: rows.read.len(),
+                width: columns.read.len(),
+            };
+            let inside = |range: &Pixels, span: &Span| {
+                range.start - span.read.start..range.end - span.read.start
+            };
+            let exact = within.cut(&tile, inside(&y, rows), inside(&x, columns));
+            let found = self.padding.cut(color_hdr, y, x);
+            let largest = |values: &mut dyn Iterator<Item = f32>| values.fold(0.0, f32::max);
+            let difference = largest(&mut found.iter().zip(&exact).map(|(a, b)| (a - b).abs()));
+            let scale = largest(&mut exact.iter().copied()).max(f32::MIN_POSITIVE);
+            error.relmse += rel_mse_image(&found, &exact) / windows.len() as f64;
+            error.largest = error.largest.max(f64::from(difference / scale));
+        }
+        Ok((!windows.is_empty()).then_some(error))
+    }
+}
+
+/// Windows around seams: where rows and columns of tiles meet, or in the middle of an axis without seams.
+fn windows(tiles: &Tiles, padding: Padding) -> Vec<(Span, Span)> {
+    let sides = (padding.padded_height(), padding.padded_width());
+    let rows = places(&tiles.rows, sides.0);
+    let columns = places(&tiles.columns, sides.1);
+    if tiles.count() == 1 {
+        return Vec::new();
+    }
+    let count = rows.len().max(columns.len()).min(WINDOWS);
+    let pick = |places: &[Span], i: usize| places[i * places.len() / count].clone();
+    (0..count)
+        .map(|i| (pick(&rows, i), pick(&columns, i)))
+        .collect()
+}
+
+/// Windows over the seams of an axis of `length` pixels, each with the exact halo.
+fn places(spans: &[Span], length: usize) -> Vec<Span> {
+    let middle = length / 2 / DOWNSAMPLING * DOWNSAMPLING;
+    let seams = match spans {
+        [_] => vec![middle],
+        _ => spans[1..].iter().map(|span| span.core.start).collect(),
+    };
+    seams
+        .into_iter()
+        .map(|seam| {
+            let core = seam.saturating_sub(WINDOW / 2)..(seam + WINDOW / 2).min(length);
+            let read = core.start.saturating_sub(EXACT_HALO)..(core.end + EXACT_HALO).min(length);
+            Span { core, read }
+        })
+        .collect()
+}

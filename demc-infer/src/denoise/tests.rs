@@ -1,0 +1,153 @@
+//! A narrow network on frames with a pattern.
+
+use demc_data::Frame;
+use demc_model::Variant;
+
+use super::*;
+use crate::bundle::testing::{bundle, frame};
+
+#[test]
+fn every_size_gives_an_image_of_its_own_size() {
+    let bundle = bundle(Variant::Demc);
+    for (width, height) in [(1, 1), (31, 33), (64, 32), (5, 70)] {
+        let out = bundle.denoise(&frame(width, height)).expect("denoised");
+        assert_eq!(out.len(), 3 * width * height);
+        assert!(out.iter().all(|x| x.is_finite() && *x >= 0.0));
+    }
+}
+
+#[test]
+fn padding_equals_an_image_padded_by_hand() {
+    let bundle = bundle(Variant::Demc);
+    let small = frame(31, 33);
+    let padding = Padding {
+        height: 33,
+        width: 31,
+    };
+    let large = Frame {
+        width: 32,
+        height: 64,
+        color: padding.pad(&small.color),
+        features: padding.pad(&small.features),
+        ..small.clone()
+    };
+    let expected = padding.crop(&bundle.denoise(&large).expect("large"));
+    assert_eq!(bundle.denoise(&small).expect("small"), expected);
+}
+
+#[test]
+fn two_runs_give_the_same_bits() {
+    let (bundle, frame) = (bundle(Variant::Semc), frame(40, 40));
+    let once = bundle.denoise(&frame).expect("once");
+    assert_eq!(once, bundle.denoise(&frame).expect("twice"));
+}
+
+#[test]
+fn the_variant_without_fusion_has_no_detail_map() {
+    let frame = frame(33, 20);
+    let map = |variant| bundle(variant).detail_map(&frame).expect("detail map");
+    assert_eq!(map(Variant::Demc).map(|m| m.len()), Some(3 * 33 * 20));
+    assert_eq!(map(Variant::DemcNosn), None);
+}
+
+#[test]
+fn buffers_that_do_not_fit_are_named() {
+    let mut frame = frame(4, 4);
+    frame.features.pop();
+    let error = bundle(Variant::Demc)
+        .denoise(&frame)
+        .expect_err("short")
+        .to_string();
+    assert!(
+        error.ends_with("features holds 191 values; 4x4 pixels need 192"),
+        "{error}"
+    );
+}
+
+/// The whole image, and tiles of it: the same to the rounding of float32 sums. Odd sizes, so that padding and tiles meet.
+#[test]
+fn tiles_with_the_exact_halo_are_the_whole_image() {
+    for variant in [Variant::Demc, Variant::DemcNosn, Variant::Semc] {
+        let bundle = bundle(variant);
+        let frame = frame(490, 450);
+        let whole = bundle.denoise(&frame).expect("whole");
+        let largest = whole.iter().fold(0.0f32, |most, x| most.max(*x));
+        for side in [128, 224] {
+            let tiling = Tiling {
+                side: Some(side),
+                ..Tiling::default()
+            };
+            let tiled = bundle
+                .denoise_tiled(&frame, &tiling, |_, _| ())
+                .expect("tiled");
+            assert!(tiled.tiles.count() >= 6 && tiled.seam_error.is_none());
+            for (a, b) in tiled.color_hdr.iter().zip(&whole) {
+                assert!(
+                    (a - b).abs() <= 2e-6 * largest,
+                    "{variant:?} {side}: {a}, {b}"
+                );
+            }
+        }
+    }
+}
+
+/// The halo is as large as it must be and no larger than the network's grid makes it: with 32 pixels less it shows.
+#[test]
+fn a_smaller_halo_is_measured_and_is_worse() {
+    let bundle = bundle(Variant::Demc);
+    let frame = frame(640, 520);
+    let error = |halo| {
+        let tiling = Tiling {
+            halo,
+            side: Some(256),
+            ..Tiling::default()
+        };
+        let denoised = bundle
+            .denoise_tiled(&frame, &tiling, |_, _| ())
+            .expect("tiled");
+        denoised.seam_error.expect("it is not exact")
+    };
+    let (none, some, most) = (error(0), error(64), error(160));
+    assert!(none.windows > 1 && none.relmse > some.relmse && some.relmse > most.relmse);
+    assert!(none.largest > 1e-3, "{none:?}");
+    assert!(
+        most.largest > 0.0 && most.largest < none.largest,
+        "{most:?}"
+    );
+}
+
+#[test]
+fn little_memory_makes_tiles_and_too_little_an_error() {
+    let bundle = bundle(Variant::Demc);
+    let frame = frame(700, 500);
+    let within = |memory| {
+        let tiling = Tiling {
+            memory: Some(memory),
+            ..Tiling::default()
+        };
+        bundle.denoise_tiled(&frame, &tiling, |_, _| ())
+    };
+    let whole = within(u64::MAX).expect("no limit");
+    assert_eq!(whole.tiles.count(), 1);
+    let (height, width) = whole.tiles.largest();
+    let limit = bundle.pass_bytes(height, width) - 1;
+    let tiled = within(limit).expect("tiles fit");
+    let (height, width) = tiled.tiles.largest();
+    assert!(tiled.tiles.count() > 1 && bundle.pass_bytes(height, width) <= limit);
+    let error = within(1000).expect_err("a thousand bytes").to_string();
+    assert_eq!(error, "pattern");
+}
+
+#[test]
+fn every_tile_is_announced() {
+    let tiling = Tiling {
+        side: Some(32),
+        ..Tiling::default()
+    };
+    let mut heard = Vec::new();
+    let bundle = bundle(Variant::ColorOnly);
+    let frame = frame(64, 40);
+    let denoised = bundle.denoise_tiled(&frame, &tiling, |done, of| heard.push((done, of)));
+    assert!(denoised.is_ok());
+    assert_eq!(heard, [(0, 4), (1, 4), (2, 4), (3, 4)]);
+}

@@ -1,0 +1,130 @@
+//! Warnings on the sample's scenes: none as they are, one for each mistake that people make with their renderer.
+
+mod common;
+
+use common::{demc_infer, random_bundle, sample};
+use demc_data::{Dataset, Frame, Split, Statistics, read_frame};
+use demc_infer::{Bundle, Names, Precision};
+
+/// A network that knows what the sample's training scenes are like, and all of the sample's frames.
+fn trained() -> (Bundle, Vec<(Split, Frame)>) {
+    let mut bundle = random_bundle();
+    let layout = bundle.meta.layout.clone();
+    let dataset = Dataset::open(&sample(), &layout).expect("the sample");
+    let training = dataset.split(Split::Train).expect("training scenes");
+    let statistics = Statistics::measure(&training, &layout, 2.2).expect("sound");
+    bundle.meta.normalizer = statistics.normalizer;
+    bundle.meta.ranges = Some(statistics.ranges);
+    let frames = dataset.scenes.iter().map(|scene| {
+        let frame = read_frame(&scene.path, &layout).expect("sound");
+        (scene.split, frame)
+    });
+    let frames = frames.collect();
+    (bundle, frames)
+}
+
+fn warnings(bundle: &Bundle, frame: &Frame) -> Vec<String> {
+    let warnings = bundle.warnings(frame).expect("sizes fit").into_iter();
+    warnings.map(|warning| warning.to_string()).collect()
+}
+
+#[test]
+fn test_scenes_pass_and_mistakes_are_named() {
+    let (bundle, frames) = trained();
+    let mut tests = frames
+        .into_iter()
+        .filter(|(split, _)| *split == Split::Test);
+    for (_, frame) in tests.by_ref() {
+        assert_eq!(warnings(&bundle, &frame), [""; 0], "{}", frame.name);
+        let pixels = frame.width * frame.height;
+        let with = |change: &dyn Fn(&mut Frame)| {
+            let mut frame = frame.clone();
+            change(&mut frame);
+            warnings(&bundle, &frame).join("\n")
+        };
+        let packed = with(&|frame| {
+            let normals = frame.features[..3 * pixels].iter_mut();
+            normals.for_each(|x| *x = *x / 2.0 + 0.5);
+        });
+        assert!(
+            packed.contains("packed into 0 to 1"),
+            "{}: {packed}",
+            frame.name
+        );
+        let turned = with(&|frame| frame.features[..3 * pixels].rotate_left(pixels));
+        assert!(turned.contains("axes swapped"), "{}: {turned}", frame.name);
+        let swapped = with(&|frame| {
+            let (normals, rest) = frame.features.split_at_mut(6 * pixels);
+            normals[..3 * pixels].swap_with_slice(&mut rest[..3 * pixels]);
+        });
+        assert!(
+            swapped.contains("normal: its length is"),
+            "{}: {swapped}",
+            frame.name
+        );
+        assert!(
+            swapped.contains("texture1: it goes down"),
+            "{}: {swapped}",
+            frame.name
+        );
+        let bright = with(&|frame| frame.color.iter_mut().for_each(|x| *x *= 100.0));
+        assert!(
+            bright.contains("stops brighter"),
+            "{}: {bright}",
+            frame.name
+        );
+        let centimetres = with(&|frame| {
+            let positions = frame.features[3 * pixels..6 * pixels].iter_mut();
+            positions.for_each(|x| *x *= 100.0);
+        });
+        assert!(
+            centimetres.contains("another unit"),
+            "{}: {centimetres}",
+            frame.name
+        );
+    }
+}
+
+#[test]
+fn check_prints_the_table_and_fails_on_a_warning() {
+    let (bundle, _) = trained();
+    let dir = tempfile::tempdir().expect("a directory");
+    let model = dir.path().join("model.safetensors");
+    bundle
+        .save(&model, Names::Burn, Precision::F32)
+        .expect("saved");
+    let list = arguments!["check", "--model", model, sample().join("test")];
+    let outcome = demc_infer(list).success();
+    assert_eq!(
+        outcome.stdout.matches("| exposure ").count(),
+        4,
+        "{}",
+        outcome.stdout
+    );
+
+    // Ranges that nothing is in.
+    let mut strict = bundle;
+    let ranges = strict.meta.ranges.as_mut().expect("they were set");
+    ranges.exposure = demc_data::ranges::Range {
+        low: 1e6,
+        high: 2e6,
+    };
+    strict
+        .save(&model, Names::Burn, Precision::F32)
+        .expect("saved");
+    let list = arguments!["check", "--model", model, "--json", sample().join("test")];
+    let outcome = demc_infer(list);
+    assert_eq!(outcome.code, 1);
+    let json: serde_json::Value = serde_json::from_str(&outcome.stdout).expect("JSON");
+    for image in json.as_array().expect("a list") {
+        let warning = image["warnings"][0].as_str().expect("a warning");
+        assert!(warning.starts_with("colour: it is "), "{warning}");
+    }
+    assert!(
+        outcome
+            .stderr
+            .ends_with("error: 4 of 4 images with warnings\n"),
+        "{}",
+        outcome.stderr
+    );
+}
