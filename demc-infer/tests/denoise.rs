@@ -5,7 +5,7 @@ mod common;
 use std::fs;
 use std::path::Path;
 
-use common::{Outcome, demc_infer, random_bundle, run_directory, sample_image};
+use common::{Outcome, demc_infer, random_bundle, run_directory, sample, sample_image};
 use demc_data::exr::ExrFile;
 use demc_data::plane::Plane;
 use demc_data::read_frame;
@@ -205,4 +205,133 @@ fn the_programs_own_model_denoises() {
 fn the_programs_own_model_is_small() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/demc.safetensors");
     assert!(fs::metadata(path).expect("a model").len() <= 30_000_000);
+}
+
+#[test]
+fn a_directory_is_gone_on_with_where_it_stopped() {
+    let (run, dir) = (run_directory(), tempfile::tempdir().expect("directory"));
+    let out = dir.path().join("out");
+    let whole = |extra: &[&str]| {
+        let mut list = arguments!["denoise", "--model", run.path(), "-o", out].to_vec();
+        list.push(sample().join("test").into());
+        list.extend(extra.iter().map(Into::into));
+        let stderr = demc_infer(list).success().stderr;
+        // A random network has warnings of its own.
+        let done = stderr.lines().find(|line| line.contains("there already"));
+        done.map(str::to_owned)
+    };
+    assert_eq!(whole(&[]), None);
+    let path = out.join("gen-room-test-1.exr");
+    let first = fs::read(&path).expect("made");
+    fs::remove_file(&path).expect("removed");
+    let kept = out.join("gen-table-test-1.exr");
+    fs::write(&kept, "not touched").expect("written");
+    let note = "note: 3 of 4 images are there already; --overwrite replaces them";
+    assert_eq!(whole(&[]).as_deref(), Some(note));
+    assert_eq!(fs::read(&path).expect("made again"), first);
+    assert_eq!(fs::read(&kept).expect("kept"), b"not touched");
+    assert_eq!(whole(&["--overwrite", "--png"]), None);
+    assert!(read_rgb(&kept).len() == 3 && out.join("gen-table-test-1.png").is_file());
+    let previews = fs::read_dir(&out).expect("directory");
+    assert_eq!(previews.count(), 8);
+}
+
+#[test]
+fn a_file_that_exists_needs_overwrite() {
+    let (run, dir) = (run_directory(), tempfile::tempdir().expect("directory"));
+    let (input, output) = (
+        sample_image("gen-table-test-1.exr"),
+        dir.path().join("a.exr"),
+    );
+    fs::write(&output, "mine").expect("written");
+    denoise(run.path(), &[&input], &output)
+        .failure(2, &format!("{} exists; --overwrite", output.display()));
+    assert_eq!(fs::read(&output).expect("kept"), b"mine");
+}
+
+#[test]
+fn a_sequence_is_denoised_frame_by_frame() {
+    let (run, dir) = (run_directory(), tempfile::tempdir().expect("directory"));
+    for number in [8, 9, 10, 12] {
+        let frame = dir.path().join(format!("shot ü.{number:04}.exr"));
+        fs::copy(sample_image("gen-table-test-1.exr"), frame).expect("copied");
+    }
+    let out = dir.path().join("out");
+    let list = arguments![
+        "denoise",
+        "--model",
+        run.path(),
+        "-o",
+        out,
+        "--frames",
+        "9-12",
+        dir.path().join("shot ü.####.exr")
+    ];
+    let outcome = demc_infer(list).success();
+    assert!(
+        outcome
+            .stderr
+            .contains("1 of the frames 9 to 12 are missing\n"),
+        "{}",
+        outcome.stderr
+    );
+    let mut names: Vec<_> = fs::read_dir(&out)
+        .expect("made")
+        .map(|entry| entry.expect("entry").file_name())
+        .collect();
+    names.sort();
+    assert_eq!(
+        names,
+        ["shot ü.0009.exr", "shot ü.0010.exr", "shot ü.0012.exr"]
+    );
+}
+
+/// The whole image and its tiles, through files in float.
+#[test]
+fn tiles_are_announced_and_equal_the_whole_image() {
+    let (run, dir) = (run_directory(), tempfile::tempdir().expect("directory"));
+    let input = sample_image("col-classroom-1.exr");
+    let with = |name: &str, flags: &[&str]| {
+        let output = dir.path().join(name);
+        let mut list = arguments!["denoise", "--model", run.path(), input, "-o", output].to_vec();
+        list.extend(["--precision", "float"].iter().chain(flags).map(Into::into));
+        let outcome = demc_infer(list).success();
+        let planes = read_rgb(&output);
+        let values: Vec<f32> = planes.iter().flat_map(Plane::to_f32).collect();
+        (outcome.stderr, values)
+    };
+    let (_, whole) = with("whole.exr", &[]);
+    let (note, tiled) = with("tiled.exr", &["--tile", "64"]);
+    assert!(
+        note.contains("4 x 4 tiles of at most 256x256 pixels, halo 192: 16.00"),
+        "{note}"
+    );
+    let largest = whole.iter().fold(0.0f32, |most, x| most.max(*x));
+    let same = whole
+        .iter()
+        .zip(&tiled)
+        .all(|(a, b)| (a - b).abs() <= 2e-6 * largest);
+    assert!(same);
+    let (note, _) = with("near.exr", &["--tile", "64", "--halo", "32"]);
+    assert!(
+        note.contains("against exact tiles, at 3 places on seams: RelMSE"),
+        "{note}"
+    );
+    let list = arguments![
+        "cost",
+        "--model",
+        run.path(),
+        input,
+        "--tile",
+        "64",
+        "--json"
+    ];
+    let cost: serde_json::Value =
+        serde_json::from_str(&demc_infer(list).success().stdout).expect("JSON");
+    assert_eq!(cost["images"][0]["tiles"], 16);
+    assert_eq!(cost["images"][0]["width"], 256);
+    let ratio = cost["images"][0]["flops"]
+        .as_f64()
+        .zip(cost["images"][0]["flops_whole"].as_f64());
+    assert!(ratio.is_some_and(|(tiled, whole)| tiled > 10.0 * whole));
 }

@@ -240,7 +240,7 @@ mod tests {
             assert_eq!(all, ["s.0009.exr", "s.0010.exr", "s.12345.exr"]);
             assert_eq!(names(&dir, pattern, Some("10-99")), ["s.0010.exr"]);
         }
-        assert_eq!(names(&dir, "s.%d.exr", None).len(), 3);
+        assert_eq!(names(&dir, "s.%d.exr", None), ["s.12345.exr"]);
     }
 
     #[test]
