@@ -1,6 +1,7 @@
 //! One rendered image with its feature buffers, checked: all buffers cover the same pixels, nothing is NaN
 //! or infinite, no radiance is negative. [`FramePlanes`] keeps the file's precision, [`Frame`] is `f32`.
 
+use std::io::{Read, Seek};
 use std::path::Path;
 
 use crate::Error;
@@ -130,7 +131,20 @@ impl FramePlanes {
         reference: Presence,
         mask: Presence,
     ) -> Result<Self, Error> {
-        let file = ExrFile::open(path)?;
+        Self::decode(ExrFile::open(path)?, layout, reference, mask)
+    }
+
+    /// Decodes and checks an image that is open already.
+    ///
+    /// # Errors
+    /// As [`read_frame`].
+    pub fn decode<R: Read + Seek>(
+        file: ExrFile<R>,
+        layout: &ChannelLayout,
+        reference: Presence,
+        mask: Presence,
+    ) -> Result<Self, Error> {
+        let path = &file.path().to_owned();
         let plan = Plan::new(&file, layout, reference, mask)?;
         let window = plan.window(path, &file)?;
         let names = plan.names();
@@ -207,8 +221,8 @@ struct Plan<'a> {
 }
 
 impl<'a> Plan<'a> {
-    fn new(
-        file: &ExrFile,
+    fn new<R: Read + Seek>(
+        file: &ExrFile<R>,
         layout: &'a ChannelLayout,
         reference: Presence,
         mask: Presence,
@@ -267,7 +281,7 @@ impl<'a> Plan<'a> {
     }
 
     /// The window that all channels have in common.
-    fn window(&self, path: &Path, file: &ExrFile) -> Result<Window, Error> {
+    fn window<R: Read + Seek>(&self, path: &Path, file: &ExrFile<R>) -> Result<Window, Error> {
         let names = self.names();
         let mut channels = names.iter().filter_map(|name| file.channel(name));
         let first = channels.next().expect("colour is always in the plan");

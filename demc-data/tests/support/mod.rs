@@ -1,6 +1,8 @@
 //! Odd EXR files and small data sets for the tests.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
+pub mod files;
+
 use std::path::{Path, PathBuf};
 
 use demc_data::transform::FeatureStats;

@@ -1,0 +1,135 @@
+//! The compressions of the format by the names that its tools give them.
+
+use std::fmt;
+use std::str::FromStr;
+
+use ::exr::prelude::Compression as Method;
+
+/// A compression that can be written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Compression {
+    /// None.
+    None,
+    /// Runs of equal bytes.
+    Rle,
+    /// Deflate, a line at a time.
+    Zips,
+    /// Deflate, 16 lines at a time.
+    Zip,
+    /// Wavelets and Huffman codes, 32 lines at a time: best for grain.
+    Piz,
+    /// Deflate of 24 bits: `float` channels lose their last 8.
+    Pxr24,
+    /// Blocks of 4x4 pixels at a fixed rate: `half` channels lose precision.
+    B44,
+    /// The same, with flat blocks in less.
+    B44a,
+    /// Cosine transform, 32 lines at a time, with loss.
+    Dwaa,
+    /// The same, 256 lines at a time.
+    Dwab,
+}
+
+/// Name, ours and the `exr` crate's; those of no name of ours cannot be written.
+const TABLE: [(&str, Option<Compression>, Method); 12] = [
+    ("none", Some(Compression::None), Method::Uncompressed),
+    ("rle", Some(Compression::Rle), Method::RLE),
+    ("zips", Some(Compression::Zips), Method::ZIP1),
+    ("zip", Some(Compression::Zip), Method::ZIP16),
+    ("piz", Some(Compression::Piz), Method::PIZ),
+    ("pxr24", Some(Compression::Pxr24), Method::PXR24),
+    ("b44", Some(Compression::B44), Method::B44),
+    ("b44a", Some(Compression::B44a), Method::B44A),
+    ("dwaa", Some(Compression::Dwaa), Method::DWAA(None)),
+    ("dwab", Some(Compression::Dwab), Method::DWAB(None)),
+    ("htj2k32", None, Method::HTJ2K32),
+    ("htj2k256", None, Method::HTJ2K256),
+];
+
+/// A name that no compression has.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("no compression {0:?}; there are {names}", names = Compression::ALL.map(Compression::name).join(", "))]
+pub struct UnknownCompression(pub String);
+
+impl Compression {
+    /// All of them.
+    pub const ALL: [Self; 10] = [
+        Self::None,
+        Self::Rle,
+        Self::Zips,
+        Self::Zip,
+        Self::Piz,
+        Self::Pxr24,
+        Self::B44,
+        Self::B44a,
+        Self::Dwaa,
+        Self::Dwab,
+    ];
+
+    /// Its name: `zip`, `dwaa`.
+    pub fn name(self) -> &'static str {
+        let row = TABLE.iter().find(|(_, ours, _)| *ours == Some(self));
+        row.map_or("", |(name, ..)| name)
+    }
+
+    pub(super) fn method(self) -> Method {
+        let row = TABLE.iter().find(|(_, ours, _)| *ours == Some(self));
+        row.map_or(Method::ZIP16, |(.., method)| *method)
+    }
+
+    /// `None` for what cannot be written.
+    pub(super) fn of(method: Method) -> Option<Self> {
+        row_of(method).and_then(|(_, ours, _)| *ours)
+    }
+}
+
+/// The name of a file's compression.
+pub(super) fn name_of(method: Method) -> &'static str {
+    row_of(method).map_or("unknown", |(name, ..)| name)
+}
+
+fn row_of(method: Method) -> Option<&'static (&'static str, Option<Compression>, Method)> {
+    // A DWA method carries a level, which is no other method.
+    let kind = std::mem::discriminant(&method);
+    TABLE
+        .iter()
+        .find(|(.., known)| std::mem::discriminant(known) == kind)
+}
+
+impl fmt::Display for Compression {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+impl FromStr for Compression {
+    type Err = UnknownCompression;
+
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        let found = Self::ALL.into_iter().find(|known| known.name() == name);
+        found.ok_or_else(|| UnknownCompression(name.to_owned()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_compression_has_a_name_and_a_method_and_comes_back_from_both() {
+        for compression in Compression::ALL {
+            assert_eq!(compression.name().parse(), Ok(compression));
+            assert_eq!(Compression::of(compression.method()), Some(compression));
+        }
+        assert_eq!(
+            Compression::of(Method::DWAA(Some(45.0))),
+            Some(Compression::Dwaa)
+        );
+        assert_eq!(Compression::of(Method::HTJ2K32), None);
+        let error = "lzma"
+            .parse::<Compression>()
+            .expect_err("no such")
+            .to_string();
+        assert!(error.starts_with("no compression \"lzma\"; there are none, rle, zips, zip, piz"));
+    }
+}

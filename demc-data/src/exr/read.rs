@@ -1,0 +1,231 @@
+//! Headers of a file and, on demand, its channels.
+
+use std::fs::{self, File};
+use std::io::{self, BufReader, Read, Seek};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use ::exr::block::lines::LineRef;
+use ::exr::error::Error as ExrError;
+use ::exr::meta::attribute::SampleType;
+use ::exr::meta::header::Header;
+use half::f16;
+
+use super::blocks::{Source, invalid};
+use super::guarded;
+use crate::Error;
+use crate::channel::{Channel, Kind, Window, full_name};
+use crate::plane::Plane;
+
+/// An open file whose headers were read and checked; its pixels were not decoded yet.
+pub struct ExrFile<R = BufReader<File>> {
+    path: PathBuf,
+    pub(super) source: Source<R>,
+    channels: Vec<Channel>,
+}
+
+impl ExrFile {
+    /// Opens `path` and reads its headers.
+    ///
+    /// # Errors
+    /// [`Error::Read`] if it cannot be opened or is no regular file, else as [`parse`](Self::parse).
+    pub fn open(path: &Path) -> Result<Self, Error> {
+        let read_error = |source| Error::Read {
+            path: path.to_owned(),
+            source,
+        };
+        // Opening a FIFO would wait for somebody to write into it; reading a device need not end.
+        if !fs::metadata(path).map_err(read_error)?.is_file() {
+            let why = io::Error::new(io::ErrorKind::InvalidInput, "not a regular file");
+            return Err(read_error(why));
+        }
+        let file = File::open(path).map_err(read_error)?;
+        Self::parse(path, BufReader::new(file))
+    }
+}
+
+impl<R: Read + Seek> ExrFile<R> {
+    /// Reads the headers of a file that is open already, or in memory; `path` is what errors call it.
+    ///
+    /// # Errors
+    /// [`Error::Exr`] if it is no EXR file, its header is damaged or promises more than the file can hold, or a part is
+    /// empty or larger than [`MAX_SIDE`](super::MAX_SIDE) or [`MAX_PIXELS`](super::MAX_PIXELS).
+    pub fn parse(path: &Path, reader: R) -> Result<Self, Error> {
+        let source = guarded(path, || Source::open(reader))?;
+        let headers = &source.meta.headers;
+        let several = headers.len() > 1;
+        let parts = headers.iter().enumerate();
+        let channels = parts.flat_map(|(part, header)| channels_of(part, header, several));
+        Ok(Self {
+            path: path.to_owned(),
+            channels: channels.collect(),
+            source,
+        })
+    }
+
+    /// What errors call the file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The channels of all parts, in the file's order.
+    pub fn channels(&self) -> &[Channel] {
+        &self.channels
+    }
+
+    /// The channel of this name; the first, should there be several.
+    pub fn channel(&self, name: &str) -> Option<&Channel> {
+        self.channels.iter().find(|channel| channel.name == name)
+    }
+
+    /// Checks that the file has all these channels.
+    ///
+    /// # Errors
+    /// [`Error::MissingChannels`], naming those that it lacks, each once, and those that it has.
+    pub fn require(&self, names: &[&str]) -> Result<(), Error> {
+        let mut missing: Vec<String> = Vec::new();
+        for name in names.iter().filter(|name| self.channel(name).is_none()) {
+            // A texture that stands in for another is asked for twice.
+            if !missing.iter().any(|known| known == name) {
+                missing.push((*name).to_owned());
+            }
+        }
+        if missing.is_empty() {
+            return Ok(());
+        }
+        let present = self
+            .channels
+            .iter()
+            .map(|channel| channel.name.clone())
+            .collect();
+        Err(Error::MissingChannels {
+            path: self.path.clone(),
+            missing,
+            present,
+        })
+    }
+
+    /// Decodes the named channels, in the order of `names`; other parts and smaller resolution levels are
+    /// not touched.
+    ///
+    /// # Errors
+    /// [`Error::MissingChannels`] if the file lacks any; [`Error::Exr`] if the pixel data is cut short or
+    /// damaged, or there is no memory for it.
+    pub fn read(mut self, names: &[&str]) -> Result<Vec<Plane>, Error> {
+        self.require(names)?;
+        let wanted: Vec<Channel> = names
+            .iter()
+            .filter_map(|name| self.channel(name))
+            .cloned()
+            .collect();
+        guarded(&self.path, || decode(&mut self.source, &wanted))
+    }
+}
+
+fn channels_of(part: usize, header: &Header, several: bool) -> Vec<Channel> {
+    let layer = header.own_attributes.layer_name.as_ref();
+    let layer = layer.map(|name| String::from_utf8_lossy(name.bytes()).into_owned());
+    let channels = header.channels.list.iter().enumerate();
+    let channels = channels.map(|(index, channel)| Channel {
+        name: full_name(
+            layer.as_deref().filter(|_| several),
+            &String::from_utf8_lossy(channel.name.bytes()),
+        ),
+        kind: match channel.sample_type {
+            SampleType::F16 => Kind::Half,
+            SampleType::F32 => Kind::Float,
+            SampleType::U32 => Kind::Uint,
+        },
+        layer: layer.clone(),
+        window: window_of(header),
+        part,
+        index,
+    });
+    channels.collect()
+}
+
+/// Decodes every full-size block of the parts that hold a wanted channel, on this thread.
+fn decode<R: Read + Seek>(
+    source: &mut Source<R>,
+    wanted: &[Channel],
+) -> Result<Vec<Plane>, ExrError> {
+    let mut planes: Vec<Plane> = wanted.iter().map(|channel| empty(channel.kind)).collect();
+    for part in 0..source.meta.headers.len() {
+        if !wanted.iter().any(|channel| channel.part == part) {
+            continue;
+        }
+        let grid = source.grid(part)?;
+        let mut here: Vec<(&Channel, &mut Plane)> = wanted
+            .iter()
+            .zip(&mut planes)
+            .filter(|(channel, _)| channel.part == part)
+            .collect();
+        for (channel, plane) in &mut here {
+            reserve(plane, channel.window)?;
+        }
+        for row in 0..grid.rows {
+            for (channel, plane) in &mut here {
+                let bottom = channel.window.height.min((row + 1) * grid.block.height());
+                grow(plane, bottom * channel.window.width);
+            }
+            for column in 0..grid.columns {
+                let block = source.block(part, &grid, (column, row))?;
+                for line in block.lines(&source.meta.headers[part].channels) {
+                    for (channel, plane) in &mut here {
+                        if channel.index == line.location.channel {
+                            copy_line(line, channel.window.width, plane)?;
+                        }
+                    }
+                }
+            }
+        }
+    }
+    Ok(planes)
+}
+
+fn copy_line(line: LineRef<'_>, width: usize, plane: &mut Plane) -> Result<(), ExrError> {
+    let start = line.location.position.1 * width + line.location.position.0;
+    let range: Range<usize> = start..start + line.location.sample_count;
+    match plane {
+        Plane::Half(samples) => line.read_samples_into_slice(&mut samples[range]),
+        Plane::Float(samples) => line.read_samples_into_slice(&mut samples[range]),
+        Plane::Uint(samples) => line.read_samples_into_slice(&mut samples[range]),
+    }
+}
+
+fn empty(kind: Kind) -> Plane {
+    match kind {
+        Kind::Half => Plane::Half(Vec::new()),
+        Kind::Float => Plane::Float(Vec::new()),
+        Kind::Uint => Plane::Uint(Vec::new()),
+    }
+}
+
+/// Takes the address space for a whole plane; memory is taken as rows are filled.
+fn reserve(plane: &mut Plane, window: Window) -> Result<(), ExrError> {
+    let samples = window.width * window.height;
+    let reserved = match plane {
+        Plane::Half(plane) => plane.try_reserve_exact(samples),
+        Plane::Float(plane) => plane.try_reserve_exact(samples),
+        Plane::Uint(plane) => plane.try_reserve_exact(samples),
+    };
+    reserved.map_err(|_| invalid(format!("no memory for a channel of {window}")))
+}
+
+fn grow(plane: &mut Plane, samples: usize) {
+    match plane {
+        Plane::Half(plane) => plane.resize(samples, f16::ZERO),
+        Plane::Float(plane) => plane.resize(samples, 0.0),
+        Plane::Uint(plane) => plane.resize(samples, 0),
+    }
+}
+
+fn window_of(header: &Header) -> Window {
+    let position = header.own_attributes.layer_position;
+    Window {
+        x: position.0,
+        y: position.1,
+        width: header.layer_size.0,
+        height: header.layer_size.1,
+    }
+}

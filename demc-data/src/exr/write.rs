@@ -1,0 +1,88 @@
+//! Three channels and nothing else.
+
+use std::io;
+use std::path::Path;
+
+use ::exr::error::Error as ExrError;
+use ::exr::prelude::{
+    AnyChannel, AnyChannels, Blocks, Compression, Encoding, FlatSamples, Image, Layer,
+    LayerAttributes, LineOrder, WritableImage,
+};
+use half::f16;
+
+use crate::{Error, file};
+
+/// The sample type of a written image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Precision {
+    /// 16 bits; values beyond its range (65504) are written as the largest.
+    Half,
+    /// 32 bits.
+    Float,
+}
+
+/// Writes linear radiance as an EXR file with channels `R G B`, ZIP-compressed, whole or not at all.
+///
+/// # Shapes
+/// `rgb` is `[3, height, width]`.
+///
+/// # Errors
+/// [`Error::Write`], naming `path`.
+///
+/// # Panics
+/// If `rgb` has another length.
+pub fn write_rgb(
+    path: &Path,
+    width: usize,
+    height: usize,
+    rgb: &[f32],
+    precision: Precision,
+) -> Result<(), Error> {
+    assert_eq!(
+        rgb.len(),
+        3 * width * height,
+        "rgb must be [3, {height}, {width}]"
+    );
+    let channels = ["R", "G", "B"]
+        .into_iter()
+        .zip(rgb.chunks_exact(width * height))
+        .map(|(name, plane)| {
+            let samples = match precision {
+                Precision::Half => {
+                    FlatSamples::F16(plane.iter().map(|&v| saturated_half(v)).collect())
+                }
+                Precision::Float => FlatSamples::F32(plane.to_vec()),
+            };
+            AnyChannel::new(name, samples)
+        });
+    let layer = Layer::new(
+        (width, height),
+        LayerAttributes::default(),
+        Encoding {
+            compression: Compression::ZIP16,
+            blocks: Blocks::ScanLines,
+            line_order: LineOrder::Increasing,
+        },
+        AnyChannels::sort(channels.collect()),
+    );
+    let image = Image::from_layer(layer);
+    file::write_whole(path, |writer| {
+        image
+            .write()
+            .non_parallel()
+            .to_buffered(writer)
+            .map_err(io_error)
+    })
+}
+
+pub(super) fn io_error(error: ExrError) -> io::Error {
+    match error {
+        ExrError::Io(source) => source,
+        other => io::Error::other(other.to_string()),
+    }
+}
+
+/// The nearest half, the largest in place of infinity.
+pub(super) fn saturated_half(value: f32) -> f16 {
+    f16::from_f32(value.clamp(f16::MIN.to_f32(), f16::MAX.to_f32()))
+}

@@ -1,0 +1,116 @@
+//! The inputs of `fuzz/`: its seeds are files of every kind, its findings are files that once did harm.
+
+mod support;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use demc_data::{ChannelLayout, Compression, read_frame};
+use exr::math::RoundingMode;
+use exr::meta::attribute::{LevelMode, SampleType};
+use support::files::{header, scene_kinds, tiled, write_file};
+use support::layout;
+
+fn inputs(of: &str) -> Vec<PathBuf> {
+    let dir = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../fuzz")
+        .join(of);
+    let files = fs::read_dir(&dir).unwrap_or_else(|error| panic!("{}: {error}", dir.display()));
+    let mut files: Vec<_> = files.map(|file| file.expect("readable").path()).collect();
+    files.sort();
+    files
+}
+
+/// The seeds of the EXR targets, the smallest files of each kind. To write them again:
+/// `cargo test --release -p demc-data --test fuzz_inputs -- --ignored`.
+#[test]
+#[ignore = "writes into fuzz/seeds"]
+fn write_seeds() {
+    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/seeds/exr");
+    fs::create_dir_all(&dir).expect("writable");
+    let small = |name: Option<&str>, method| header(name, (6, 5), scene_kinds(), method);
+    use exr::prelude::Compression as Method;
+    for (name, method) in [
+        ("none", Method::Uncompressed),
+        ("rle", Method::RLE),
+        ("zips", Method::ZIP1),
+        ("zip", Method::ZIP16),
+        ("piz", Method::PIZ),
+        ("pxr24", Method::PXR24),
+        ("b44", Method::B44),
+        ("b44a", Method::B44A),
+        ("dwaa", Method::DWAA(None)),
+        ("dwab", Method::DWAB(Some(20.0))),
+    ] {
+        let size = match name {
+            // More than one block of 16 lines.
+            "zip" => (6, 20),
+            // Blocks that get smaller: others are stored as they are.
+            "piz" | "dwaa" | "dwab" => (24, 12),
+            _ => (6, 5),
+        };
+        let part = header(None, size, scene_kinds(), method);
+        write_file(&dir.join(format!("{name}.exr")), vec![part]);
+    }
+    for (name, levels) in [
+        ("tiles", LevelMode::Singular),
+        ("mip", LevelMode::MipMap),
+        ("rip", LevelMode::RipMap),
+    ] {
+        let part = tiled(small(None, Method::RLE), levels, RoundingMode::Up);
+        write_file(&dir.join(format!("{name}.exr")), vec![part]);
+    }
+    let ids = header(
+        Some("ids"),
+        (6, 5),
+        vec![("id".to_owned(), SampleType::U32)],
+        Method::ZIP1,
+    );
+    let parts = vec![small(Some(""), Method::ZIP16), ids];
+    write_file(&dir.join("parts.exr"), parts);
+}
+
+#[test]
+fn every_seed_of_a_file_reads() {
+    let seeds = inputs("seeds/exr");
+    assert_eq!(seeds.len(), 14);
+    for path in seeds {
+        let frame = read_frame(&path, &layout()).unwrap_or_else(|error| panic!("{error}"));
+        assert!(frame.width >= 6, "{}", path.display());
+    }
+    let names = Compression::ALL.map(|compression| format!("{compression}.exr"));
+    let seeds = inputs("seeds/exr");
+    assert!(
+        names
+            .iter()
+            .all(|name| seeds.iter().any(|seed| seed.ends_with(name)))
+    );
+}
+
+#[test]
+fn every_finding_in_a_file_is_one_line_now() {
+    for path in inputs("findings/exr") {
+        if let Err(error) = read_frame(&path, &layout()) {
+            let message = error.to_string();
+            assert!(message.contains(&path.display().to_string()), "{message}");
+            assert!(!message.contains('\n'), "{message}");
+        }
+    }
+}
+
+#[test]
+fn every_seed_and_finding_of_a_layout_is_a_layout_or_one_line() {
+    for path in inputs("seeds/layout")
+        .into_iter()
+        .chain(inputs("findings/layout"))
+    {
+        let bytes = fs::read(&path).expect("readable");
+        if let Err(error) = ChannelLayout::from_toml("x.toml", &String::from_utf8_lossy(&bytes)) {
+            assert!(
+                !error.to_string().contains('\n'),
+                "{}: {error}",
+                path.display()
+            );
+        }
+    }
+}

@@ -1,0 +1,43 @@
+//! Bytes of an EXR file to all its channels, and to the checked buffers of a layout.
+#![no_main]
+
+use std::io::Cursor;
+use std::path::Path;
+
+use demc_data::ChannelLayout;
+use demc_data::channel::Kind;
+use demc_data::exr::ExrFile;
+use demc_data::frame::{FramePlanes, Presence};
+use demc_fuzz::{allow_caught_panics, check_message};
+use libfuzzer_sys::fuzz_target;
+
+const NAME: &str = "input.exr";
+
+fuzz_target!(init: allow_caught_panics(), |bytes: &[u8]| {
+    let open = || ExrFile::parse(Path::new(NAME), Cursor::new(bytes));
+    let file = match open() {
+        Ok(file) => file,
+        Err(error) => return check_message(&error, NAME),
+    };
+    let channels = file.channels().to_vec();
+    let names: Vec<&str> = channels.iter().map(|channel| channel.name.as_str()).collect();
+    match file.read(&names) {
+        Ok(planes) => {
+            assert_eq!(planes.len(), channels.len());
+            for plane in planes {
+                let sizes = channels.iter().map(|c| {
+                    let bytes = if c.kind == Kind::Half { 2 } else { 4 };
+                    c.window.width * c.window.height * bytes
+                });
+                assert!(sizes.into_iter().any(|size| size == plane.bytes()));
+            }
+        }
+        Err(error) => check_message(&error, NAME),
+    }
+    let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
+    let file = open().expect("it opened before");
+    match FramePlanes::decode(file, &layout, Presence::IfThere, Presence::IfThere) {
+        Ok(planes) => assert_eq!((planes.color.len(), planes.features.len()), (3, 12)),
+        Err(error) => check_message(&error, NAME),
+    }
+});

@@ -1,0 +1,47 @@
+//! Bytes of an EXR file to its rewritten self, which has to read back with the same channels.
+#![no_main]
+
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+
+use demc_data::exr::ExrFile;
+use demc_data::{ChannelLayout, WriteOptions, write_denoised};
+use demc_fuzz::allow_caught_panics;
+use libfuzzer_sys::fuzz_target;
+
+/// In memory where there is such a directory: a file is written for every input.
+static DIR: LazyLock<PathBuf> = LazyLock::new(|| {
+    let memory = Path::new("/dev/shm");
+    let parent = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };
+    let dir = parent.join(format!("demc-fuzz-{}", std::process::id()));
+    std::fs::create_dir_all(&dir).expect("a writable directory");
+    dir
+});
+
+fuzz_target!(init: allow_caught_panics(), |bytes: &[u8]| {
+    let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
+    let Ok(file) = ExrFile::parse(Path::new("input.exr"), Cursor::new(bytes)) else {
+        return;
+    };
+    let Some(color) = file.channel(&layout.color[0]) else {
+        return;
+    };
+    let pixels = color.window.width * color.window.height;
+    if pixels > 1 << 20 {
+        return;
+    }
+    let names = |file: &[demc_data::channel::Channel]| -> Vec<_> {
+        file.iter().map(|c| (c.name.clone(), c.window, c.layer.clone())).collect()
+    };
+    let expected = names(file.channels());
+    let (input, output) = (DIR.join("in.exr"), DIR.join("out.exr"));
+    std::fs::write(&input, bytes).expect("writable");
+    let color = vec![0.5; 3 * pixels];
+    if write_denoised(&input, &layout, &color, &output, &WriteOptions::default()).is_ok() {
+        let written = ExrFile::open(&output).expect("what was written is readable");
+        assert_eq!(names(written.channels()), expected);
+        let planes = written.read(&["R", "G", "B"]).expect("what was written is readable");
+        assert!(planes.iter().all(|plane| plane.to_f32().iter().all(|&sample| sample == 0.5)));
+    }
+});
