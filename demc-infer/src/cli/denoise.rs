@@ -4,7 +4,7 @@ use std::fs;
 use std::path::PathBuf;
 
 use anyhow::Context;
-use clap::{Args, ValueEnum};
+use clap::Args;
 use demc_infer::denoise::SeamError;
 use demc_infer::guard::EnergyBias;
 use demc_infer::{Bundle, Picture};
@@ -12,13 +12,14 @@ use demc_infer::{Bundle, Picture};
 use super::inputs::{Frames, Inputs};
 use super::jobs::{Job, Jobs};
 use super::tiling::{TilingFlags, describe};
+use super::writing::Writing;
 use super::{Clamped, DeviceFlag, Model};
 use crate::progress::Progress;
 
 /// Denoise OpenEXR images of any size.
 ///
-/// The channels are those of the layout that the model was trained with; `demc-infer inspect` shows it. Negative radiance counts
-/// as 0. An image that does not fit into memory is denoised in tiles that equal it; `demc-infer cost` tells beforehand.
+/// The channels are those of the layout that the model was trained with; `demc-infer inspect` shows it. The output is the input with
+/// another colour: parts, windows, attributes, compression and all other channels stay. Negative radiance counts as 0. An image that does not fit into memory is denoised in tiles that equal it; `demc-infer cost` tells beforehand.
 ///
 /// A file that fails is reported, the others are still denoised, and the exit code is 1 in the end. An image that is unlike what
 /// the model was trained on gets a warning with the likely cause.
@@ -45,9 +46,8 @@ pub struct Denoise {
     /// Of sequences, only these frames
     #[arg(long, value_name = "FIRST-LAST")]
     frames: Option<Frames>,
-    /// Type of the output channels: half is what renderers write (11 bits of precision, up to 65504)
-    #[arg(long, value_enum, default_value = "half")]
-    precision: Precision,
+    #[command(flatten)]
+    writing: Writing,
     /// Also write a preview beside each output, NAME.png: clip(2^EXPOSURE x, 0, 1)^(1/2.2)
     #[arg(long)]
     png: bool,
@@ -64,14 +64,6 @@ pub struct Denoise {
     tiling: TilingFlags,
     #[command(flatten)]
     device: DeviceFlag,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-enum Precision {
-    /// 16-bit floating point
-    Half,
-    /// 32-bit floating point
-    Float,
 }
 
 impl Denoise {
@@ -148,10 +140,6 @@ impl Denoise {
         if let Some(warning) = EnergyBias::of(&frame, image).warning() {
             progress.line(format_args!("warning: {name}: {warning}"));
         }
-        let precision = match self.precision {
-            Precision::Half => demc_data::Precision::Half,
-            Precision::Float => demc_data::Precision::Float,
-        };
         // The preview first: an image that is there is done.
         if self.png {
             let exposed: Vec<f32> = image.iter().map(|x| x * self.exposure.exp2()).collect();
@@ -160,7 +148,9 @@ impl Denoise {
                 .write_png(&path)
                 .with_context(|| format!("cannot write {}", path.display()))?;
         }
-        demc_data::write_rgb(&job.output, frame.width, frame.height, image, precision)?;
+        for note in self.writing.write(job, &bundle.meta.layout, image)? {
+            progress.line(format_args!("note: {name}: {note}"));
+        }
         Ok(frame.clamped)
     }
 }

@@ -12,6 +12,7 @@ mod inputs;
 mod inspect;
 mod jobs;
 mod tiling;
+mod writing;
 
 use std::path::{Path, PathBuf};
 

@@ -57,7 +57,7 @@ impl EnergyBias {
         (bias.abs() > SMALL && bias.abs() > SURE * standard_error).then(|| Warning {
             what: "output".into(),
             found: format!(
-                "its mean is {:.0} % {} the input's (+- {:.0} %)",
+                "its mean is {:.0} % {} the input's (+- {:.1} %)",
                 100.0 * bias.abs(),
                 if bias < 0.0 { "below" } else { "above" },
                 100.0 * standard_error
