@@ -12,6 +12,7 @@ pub mod denoise;
 pub mod device;
 pub mod evaluate;
 pub mod memory;
+pub mod onnx;
 pub mod padding;
 pub mod picture;
 

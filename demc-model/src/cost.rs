@@ -10,6 +10,12 @@ use crate::weights::{Builder, Weight};
 const MULTIPLY_ADD: f64 = 2.0;
 
 impl ModelConfig {
+    /// Name and shape of every weight, in the order of the fields.
+    pub fn weight_shapes(&self) -> Vec<(String, Vec<usize>)> {
+        let shapes = shapes(self).into_iter();
+        shapes.map(|weight| (weight.name, weight.shape)).collect()
+    }
+
     /// Number of trainable values: what [`Denoiser::parameter_count`] counts, without a network of this width.
     pub fn parameter_count(&self) -> u64 {
         let count = |config: &ModelConfig| {

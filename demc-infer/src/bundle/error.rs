@@ -89,6 +89,12 @@ pub enum BundleError {
         /// The value.
         value: f32,
     },
+    /// A network beyond what one ONNX file can hold.
+    #[error("an ONNX file of {bytes} bytes: protobuf's limit is 2 GiB; export with f16, or a narrower network")]
+    TooLargeForOnnx {
+        /// What it would need.
+        bytes: usize,
+    },
     /// What was read back after writing is not what was written.
     #[error("{}: read back after writing, but {what} differs: do not use this file", path.display())]
     ReadBack {

@@ -129,6 +129,15 @@ impl Bundle {
         }
     }
 
+    /// The bundle that a file of this precision holds: with its weights rounded, on `flex`.
+    ///
+    /// # Errors
+    /// A weight that f16 cannot hold.
+    pub fn rounded(&self, precision: Precision) -> Result<Self, BundleError> {
+        let bytes = self.to_bytes(Names::Burn, precision)?;
+        BundleFile::parse("memory".into(), &bytes)?.into_bundle(&Device::flex())
+    }
+
     /// Loads a run directory (its best weights, else those of the latest checkpoint), a checkpoint directory or a
     /// bundle file, with either set of names, onto `device`. f16 tensors become f32.
     ///

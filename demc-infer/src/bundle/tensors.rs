@@ -34,7 +34,7 @@ pub(super) fn serialize(
 }
 
 /// Little-endian bytes of float32 values.
-pub(super) fn f32_bytes(values: &[f32]) -> Vec<u8> {
+pub(crate) fn f32_bytes(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 
