@@ -15,6 +15,7 @@ pub mod memory;
 pub mod onnx;
 pub mod padding;
 pub mod picture;
+pub mod verify;
 
 pub use bundle::{Bundle, BundleError, BundleFile, BundleMeta, Names, Precision};
 pub use denoise::DenoiseError;

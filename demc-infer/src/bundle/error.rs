@@ -90,7 +90,9 @@ pub enum BundleError {
         value: f32,
     },
     /// A network beyond what one ONNX file can hold.
-    #[error("an ONNX file of {bytes} bytes: protobuf's limit is 2 GiB; export with f16, or a narrower network")]
+    #[error(
+        "an ONNX file of {bytes} bytes: protobuf's limit is 2 GiB; export with f16, or a narrower network"
+    )]
     TooLargeForOnnx {
         /// What it would need.
         bytes: usize,

@@ -8,6 +8,7 @@ mod evaluate;
 mod export;
 mod inspect;
 
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Parser, Subcommand};
@@ -111,6 +112,20 @@ impl Clamped {
             eprintln!("note: {samples} negative radiance sample(s) in {images} image(s) set to 0");
         }
     }
+}
+
+/// Refuses an output that would replace an input: `inputs` are files and what a message calls them.
+fn not_an_input(output: &Path, inputs: &[(&Path, &str)]) -> Result<(), Usage> {
+    let Ok(target) = fs::canonicalize(output) else {
+        return Ok(());
+    };
+    for (input, name) in inputs {
+        if fs::canonicalize(input).is_ok_and(|input| input == target) {
+            let output = output.display();
+            return Err(Usage(format!("output {output} would replace {name}")));
+        }
+    }
+    Ok(())
 }
 
 /// Writes `text` and a line end to stdout for `-`, else to a file.

@@ -78,12 +78,7 @@ impl Graph {
     }
 
     fn block(&mut self, path: &str, x: &Value, block: &ConvBlock) -> Value {
-        let y = self.conv(
-            &format!("{path}.conv"),
-            x,
-            &block.conv,
-            block.norm.as_ref(),
-        );
+        let y = self.conv(&format!("{path}.conv"), x, &block.conv, block.norm.as_ref());
         self.node("Relu", &format!("{path}.relu"), &[&y], &[])
     }
 
