@@ -81,6 +81,14 @@ pub enum BundleError {
         /// The first tensor that does not fit.
         source: WeightsError,
     },
+    /// Tensors that do not make the network that they are said to be of; every one of them.
+    #[error("{}: {problems}", path.display())]
+    Import {
+        /// The file.
+        path: PathBuf,
+        /// What is missing, unknown, of another shape or type, or of no use.
+        problems: String,
+    },
     /// A weight beyond f16's largest value.
     #[error("tensor {name}: {value} does not fit into f16; export with f32")]
     Overflow {

@@ -11,6 +11,7 @@
 mod encode;
 mod error;
 mod file;
+mod import;
 pub mod locate;
 pub mod tensors;
 
@@ -168,6 +169,8 @@ impl BundleFile {
     }
 }
 
+#[cfg(test)]
+mod hostile;
 #[cfg(test)]
 pub(crate) mod testing;
 #[cfg(test)]

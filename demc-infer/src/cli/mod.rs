@@ -6,6 +6,7 @@
 mod denoise;
 mod evaluate;
 mod export;
+mod import;
 mod inspect;
 
 use std::fs;
@@ -15,7 +16,7 @@ use clap::{Args, Parser, Subcommand};
 use demc_infer::compute::ComputeFlags;
 use demc_infer::{Bundle, BundleError, BundleFile, device};
 
-/// Use a trained DEMC network: denoise renders, score it, export its weights.
+/// Use a trained DEMC network: denoise renders, score it, move its weights out and in.
 #[derive(Parser)]
 #[command(
     version,
@@ -32,6 +33,7 @@ enum Command {
     Denoise(denoise::Denoise),
     Evaluate(evaluate::Evaluate),
     Export(export::Export),
+    Import(import::Import),
     Inspect(inspect::Inspect),
 }
 
@@ -46,6 +48,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         Command::Denoise(command) => command.run(),
         Command::Evaluate(command) => command.run(),
         Command::Export(command) => command.run(),
+        Command::Import(command) => command.run(),
         Command::Inspect(command) => command.run(),
     }
 }
