@@ -36,11 +36,11 @@ pub enum Runtime {
 }
 
 impl Runtime {
-    /// What the script calls it, and what `pip install` needs for it.
+    /// What the script calls it, and what `pip install` takes for it; `./python` is in this project's repository.
     fn words(self) -> [&'static str; 2] {
         match self {
             Runtime::OnnxRuntime => ["onnx", "numpy onnxruntime"],
-            Runtime::PyTorch => ["torch", "./python, in this project's repository"],
+            Runtime::PyTorch => ["torch", "./python"],
         }
     }
 }
@@ -107,7 +107,7 @@ pub enum VerifyError {
         source: std::io::Error,
     },
     /// It lacks what runs the file.
-    #[error("{} -m pip install {packages}: {detail}", python.display())]
+    #[error("{0} cannot import what runs the file ({0} -m pip install {packages}): {detail}", python.display())]
     Packages {
         /// The interpreter.
         python: PathBuf,

@@ -2,8 +2,10 @@
 #![allow(dead_code, reason = "each test uses its part")]
 
 use std::ffi::OsStr;
+use std::fs;
 use std::io::Write;
 use std::ops::Range;
+use std::path::Path;
 use std::process::{Command, Output};
 
 use burn::tensor::Device;
@@ -52,6 +54,18 @@ impl Python {
                 "{program} cannot import {packages} (pip install {install}): {last}"
             )),
         }
+    }
+
+    /// The program.
+    pub fn path(&self) -> &Path {
+        Path::new(&self.0)
+    }
+
+    /// Runs it, to success.
+    pub fn succeed(&self, arguments: &[&Path]) {
+        let Output { status, stderr, .. } = self.run(arguments).expect("it ran before");
+        let stderr = String::from_utf8_lossy(&stderr);
+        assert!(status.success(), "{arguments:?}: {stderr}");
     }
 
     /// Runs it.
@@ -108,4 +122,17 @@ pub fn random_bundle(
 /// Random values.
 pub fn uniform(low: f32, high: f32, count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
     (0..count).map(|_| rng.random_range(low..high)).collect()
+}
+
+/// Writes raw float32.
+pub fn write_floats<'a>(path: &Path, values: impl IntoIterator<Item = &'a f32>) {
+    let bytes: Vec<u8> = values.into_iter().flat_map(|v| v.to_le_bytes()).collect();
+    fs::write(path, bytes).expect("a writable temporary directory");
+}
+
+/// Reads them.
+pub fn read_floats(path: &Path) -> Vec<f32> {
+    let bytes = fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    let words = bytes.as_chunks().0.iter();
+    words.map(|word| f32::from_le_bytes(*word)).collect()
 }
