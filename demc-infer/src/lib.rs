@@ -50,9 +50,11 @@ pub mod device;
 pub mod evaluate;
 pub mod guard;
 pub mod memory;
+pub mod onnx;
 pub mod padding;
 pub mod picture;
 pub mod tiles;
+pub mod verify;
 
 pub use bundle::{Bundle, BundleError, BundleFile, BundleMeta, Names, Precision};
 pub use denoise::{DenoiseError, Denoised};

@@ -10,6 +10,17 @@ use crate::weights::{Builder, Weight};
 const MULTIPLY_ADD: f64 = 2.0;
 
 impl ModelConfig {
+    /// Name and shape of every weight, in the order of the fields, without a network of this width: each axis is a multiple of
+    /// the width or fixed, so a straight line through those at widths 1 and 2.
+    pub fn weight_shapes(&self) -> Vec<(String, Vec<usize>)> {
+        let [narrow, wide] = [1, 2].map(|width| shapes(&ModelConfig { width, ..*self }));
+        let line = |(a, b): (&usize, &usize)| a + (b - a) * (self.width - 1);
+        let weights = narrow.into_iter().zip(wide);
+        weights
+            .map(|(a, b)| (a.name, a.shape.iter().zip(&b.shape).map(line).collect()))
+            .collect()
+    }
+
     /// Number of trainable values: what [`Denoiser::parameter_count`] counts, without a network of this width.
     pub fn parameter_count(&self) -> u64 {
         let count = |config: &ModelConfig| {
@@ -157,6 +168,9 @@ mod tests {
         for variant in Variant::ALL {
             for reading in Reading::ALL {
                 let wide = config(variant, reading, 7);
+                let named = |w: Weight| (w.name, w.shape);
+                let expected: Vec<_> = shapes(&wide).into_iter().map(named).collect();
+                assert_eq!(wide.weight_shapes(), expected);
                 let built: f64 = shapes(&wide)
                     .iter()
                     .filter(|weight| weight.is_trainable())

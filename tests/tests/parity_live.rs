@@ -3,19 +3,18 @@
 //! Needs a Python with the package of `python/` (`pip install ./python`), named by `DEMC_PYTHON` (default `python3`).
 //! Without one the test says that it was skipped; with `DEMC_REQUIRE_TORCH=1` it fails.
 
+mod live;
 #[path = "parity/tensors.rs"]
 mod tensors;
 
 use std::collections::HashMap;
-use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
 
 use burn::tensor::{Device, Tensor, TensorData};
-use demc_data::{ChannelLayout, FeatureStats, Normalizer};
-use demc_infer::{Bundle, BundleMeta, Names, Precision};
-use demc_model::{Detail, Head, ModelConfig, Reading, Variant, Weight, Weights};
-use rand::{RngExt, SeedableRng};
+use demc_infer::{Bundle, Names, Precision};
+use demc_model::{Reading, Variant};
+use live::{FEATURES, Python, random_bundle, uniform};
+use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use safetensors::tensor::{Dtype, TensorView};
 use tempfile::TempDir;
@@ -23,8 +22,6 @@ use tensors::{Tolerance, assert_close, read};
 
 /// Not square and of two images; nothing in a file says it.
 const SHAPE: [usize; 4] = [2, 3, 64, 96];
-const FEATURES: usize = 12;
-const WIDTH: usize = 4;
 
 /// What the project promises, against the output's largest value; measured: 1e-6.
 const OUTPUT: Tolerance = Tolerance {
@@ -35,28 +32,23 @@ const OUTPUT: Tolerance = Tolerance {
 
 #[test]
 fn pytorch_loads_every_export_strictly_and_agrees() {
-    let python = Python::of_this_machine();
-    if let Err(reason) = python.check() {
-        assert!(
-            std::env::var("DEMC_REQUIRE_TORCH").as_deref() != Ok("1"),
-            "DEMC_REQUIRE_TORCH=1, but {reason}"
-        );
-        // Not `println!`, which the test harness swallows.
-        writeln!(std::io::stderr(), "skipped: {reason}").expect("stderr can be written");
+    let Some(python) = Python::with("torch, demc", "./python", "DEMC_REQUIRE_TORCH") else {
         return;
-    }
+    };
     for variant in Variant::ALL {
         for reading in Reading::ALL {
-            python.agrees(variant, reading, Names::Torch, Precision::F32);
+            agrees(&python, variant, reading, Names::Torch, Precision::F32);
         }
     }
-    python.agrees(
+    agrees(
+        &python,
         Variant::Demc,
         Reading::Released,
         Names::Burn,
         Precision::F32,
     );
-    python.agrees(
+    agrees(
+        &python,
         Variant::Demc,
         Reading::Released,
         Names::Torch,
@@ -64,130 +56,61 @@ fn pytorch_loads_every_export_strictly_and_agrees() {
     );
 }
 
-/// A Python interpreter.
-struct Python(String);
+fn agrees(python: &Python, variant: Variant, reading: Reading, names: Names, precision: Precision) {
+    // Fresh weights and inputs at each run; the seed stands in every failure.
+    let seed: u64 = rand::random();
+    let what = format!(
+        "{}, {} reading, {names:?} names, {precision:?}, seed {seed}",
+        variant.spec().name,
+        reading.spec().name
+    );
+    let folder = TempDir::new().expect("a temporary directory");
+    let [bundle, input, output] = ["bundle", "input", "output"]
+        .map(|name| folder.path().join(name).with_extension("safetensors"));
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    random_bundle(variant, reading, -0.05..0.1, &mut rng)
+        .save(&bundle, names, precision)
+        .expect("the bundle is written");
+    let [_, colors, height, width] = SHAPE;
+    let color_gamma = uniform(0.0, 1.5, SHAPE[0] * colors * height * width, &mut rng);
+    let features_z = uniform(-1.7, 1.7, SHAPE[0] * FEATURES * height * width, &mut rng);
+    write_input(&input, &color_gamma, &features_z);
 
-impl Python {
-    fn of_this_machine() -> Self {
-        Python(std::env::var("DEMC_PYTHON").unwrap_or_else(|_| "python3".into()))
-    }
+    let text = |path: &PathBuf| path.to_str().expect("a path in UTF-8").to_string();
+    let run = python
+        .run(["-m", "demc", &text(&bundle), &text(&input), &text(&output)])
+        .expect("it ran before");
+    assert!(
+        run.status.success(),
+        "{what}: {}",
+        String::from_utf8_lossy(&run.stderr)
+    );
 
-    /// Whether it has what the test needs; else why not.
-    fn check(&self) -> Result<(), String> {
-        let Python(program) = self;
-        let output = self
-            .run(["-c", "import torch, demc"])
-            .map_err(|e| format!("{program} does not run: {e}"))?;
-        let stderr = String::from_utf8_lossy(&output.stderr);
-        let last = stderr.lines().last().unwrap_or_default();
-        match output.status.success() {
-            true => Ok(()),
-            false => Err(format!(
-                "{program} cannot import torch and demc (pip install ./python): {last}"
-            )),
-        }
-    }
-
-    fn run<const N: usize>(&self, arguments: [&str; N]) -> std::io::Result<Output> {
-        // From a directory without a package `demc`, so that the installed one is found.
-        Command::new(&self.0)
-            .args(arguments)
-            .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .output()
-    }
-
-    fn agrees(&self, variant: Variant, reading: Reading, names: Names, precision: Precision) {
-        // Fresh weights and inputs at each run; the seed stands in every failure.
-        let seed: u64 = rand::random();
-        let what = format!(
-            "{}, {} reading, {names:?} names, {precision:?}, seed {seed}",
-            variant.spec().name,
-            reading.spec().name
-        );
-        let folder = TempDir::new().expect("a temporary directory");
-        let [bundle, input, output] = ["bundle", "input", "output"]
-            .map(|name| folder.path().join(name).with_extension("safetensors"));
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        random_bundle(variant, reading, &mut rng)
-            .save(&bundle, names, precision)
-            .expect("the bundle is written");
-        let [_, colors, height, width] = SHAPE;
-        let color_gamma = uniform(0.0, 1.5, SHAPE[0] * colors * height * width, &mut rng);
-        let features_z = uniform(-1.7, 1.7, SHAPE[0] * FEATURES * height * width, &mut rng);
-        write_input(&input, &color_gamma, &features_z);
-
-        let text = |path: &PathBuf| path.to_str().expect("a path in UTF-8").to_string();
-        let run = self
-            .run(["-m", "demc", &text(&bundle), &text(&input), &text(&output)])
-            .expect("it ran before");
-        assert!(
-            run.status.success(),
-            "{what}: {}",
-            String::from_utf8_lossy(&run.stderr)
-        );
-
-        // Rounding to f16 has been done once, in the file, for both sides.
-        let device = Device::flex();
-        let model = Bundle::load(&bundle, &device)
-            .expect("the bundle loads")
-            .model;
-        let tensor = |values, channels| {
-            Tensor::<4>::from_data(
-                TensorData::new(values, [SHAPE[0], channels, height, width]),
-                &device,
-            )
-        };
-        let ours = model.forward(tensor(color_gamma, colors), tensor(features_z, FEATURES));
-        let ours: Vec<f32> = ours.into_data().try_to_vec().expect("float32");
-        let theirs = &read(&output)["output"];
-        assert_eq!(theirs.shape, SHAPE, "{what}");
-        let lit = theirs.data.iter().filter(|&&v| v > 0.1).count();
-        assert!(
-            lit > theirs.data.len() / 2,
-            "{what}: an output of nearly only zeros tests nothing"
-        );
-        let share = assert_close(&what, &ours, &theirs.data, OUTPUT);
-        println!(
-            "{what}: {:.1e} of the largest value",
-            share * OUTPUT.of_largest
-        );
-    }
-}
-
-/// A network with its initial weights moved at random, so that no bias is zero and no running statistic trivial.
-fn random_bundle(variant: Variant, reading: Reading, rng: &mut ChaCha8Rng) -> Bundle {
-    let config = ModelConfig {
-        variant,
-        reading,
-        width: WIDTH,
-        head: Head::Grey,
-        detail: Detail::default(),
-    };
+    // Rounding to f16 has been done once, in the file, for both sides.
     let device = Device::flex();
-    let mut weights = config.init(rng, [0.5, 0.4, 0.3], &device).weights();
-    for Weight { data, .. } in &mut weights {
-        data.iter_mut()
-            .for_each(|value| *value += rng.random_range(-0.05..0.1));
-    }
-    let normalizer = Normalizer {
-        gamma: 2.2,
-        features: FeatureStats {
-            mean: [0.0; FEATURES],
-            std: [1.0; FEATURES],
-        },
-        flat_color: [0.5, 0.4, 0.3],
+    let model = Bundle::load(&bundle, &device)
+        .expect("the bundle loads")
+        .model;
+    let tensor = |values, channels| {
+        Tensor::<4>::from_data(
+            TensorData::new(values, [SHAPE[0], channels, height, width]),
+            &device,
+        )
     };
-    let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
-    Bundle {
-        model: config
-            .load(&mut Weights::new(weights), &device)
-            .expect("its own weights"),
-        meta: BundleMeta::new(config, normalizer, layout, 0),
-    }
-}
-
-fn uniform(low: f32, high: f32, count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
-    (0..count).map(|_| rng.random_range(low..high)).collect()
+    let ours = model.forward(tensor(color_gamma, colors), tensor(features_z, FEATURES));
+    let ours: Vec<f32> = ours.into_data().try_to_vec().expect("float32");
+    let theirs = &read(&output)["output"];
+    assert_eq!(theirs.shape, SHAPE, "{what}");
+    let lit = theirs.data.iter().filter(|&&v| v > 0.1).count();
+    assert!(
+        lit > theirs.data.len() / 2,
+        "{what}: an output of nearly only zeros tests nothing"
+    );
+    let share = assert_close(&what, &ours, &theirs.data, OUTPUT);
+    println!(
+        "{what}: {:.1e} of the largest value",
+        share * OUTPUT.of_largest
+    );
 }
 
 fn write_input(path: &Path, color_gamma: &[f32], features_z: &[f32]) {

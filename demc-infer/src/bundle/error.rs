@@ -81,6 +81,14 @@ pub enum BundleError {
         /// The first tensor that does not fit.
         source: WeightsError,
     },
+    /// Tensors that do not make the network that they are said to be of; every one of them.
+    #[error("{}: {problems}", path.display())]
+    Import {
+        /// The file.
+        path: PathBuf,
+        /// What is missing, unknown, of another shape or type, or of no use.
+        problems: String,
+    },
     /// A weight beyond f16's largest value.
     #[error("tensor {name}: {value} does not fit into f16; export with f32")]
     Overflow {
@@ -88,6 +96,14 @@ pub enum BundleError {
         name: String,
         /// The value.
         value: f32,
+    },
+    /// A network beyond what one ONNX file can hold.
+    #[error(
+        "an ONNX file of {bytes} bytes: protobuf's limit is 2 GiB; export with f16, or a narrower network"
+    )]
+    TooLargeForOnnx {
+        /// What it would need.
+        bytes: usize,
     },
     /// What was read back after writing is not what was written.
     #[error("{}: read back after writing, but {what} differs: do not use this file", path.display())]

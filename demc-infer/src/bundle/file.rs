@@ -1,17 +1,23 @@
 //! A bundle file taken apart: header and tensors, before they are a network.
 
-use std::fs;
+use std::fs::File;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use demc_data::frame::FEATURE_NAMES;
 use demc_model::Weight;
 use safetensors::SafeTensors;
-use safetensors::tensor::Dtype;
+use safetensors::tensor::{Dtype, Metadata};
 use serde::Deserialize;
 
 use super::encode::KEY;
-use super::tensors::values;
+use super::tensors::{one_line, values};
 use super::{BundleError, BundleMeta, FORMAT, Names, Precision, locate};
+
+/// Longest header that is read; ours: that of the widest network is 20 kB.
+const LONGEST_HEADER: u64 = 4 << 20;
+/// Bytes before the header: its length.
+const LENGTH: usize = 8;
 
 /// What a bundle file holds, checked as far as that goes without building the network.
 #[derive(Debug, Clone)]
@@ -36,10 +42,7 @@ impl BundleFile {
     /// than f32 and f16 or with NaN or infinity in it; statistics that nothing can be divided by.
     pub fn read(path: &Path) -> Result<Self, BundleError> {
         let path = locate::locate(path)?;
-        let bytes = fs::read(&path).map_err(|source| BundleError::Read {
-            path: path.clone(),
-            source,
-        })?;
+        let bytes = read(&path)?;
         Self::parse(path, &bytes)
     }
 
@@ -48,16 +51,8 @@ impl BundleFile {
     /// # Errors
     /// As [`read`](Self::read), but for reading.
     pub fn parse(path: PathBuf, bytes: &[u8]) -> Result<Self, BundleError> {
-        let damaged = |error: safetensors::SafeTensorError| BundleError::Damaged {
-            path: path.clone(),
-            detail: error.to_string(),
-        };
-        let (_, header) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
-        let entry = header.metadata().as_ref().and_then(|all| all.get(KEY));
-        let entry = entry.ok_or_else(|| BundleError::Foreign { path: path.clone() })?;
-        let (meta, names) = parse_header(entry, &path)?;
-
-        let tensors = SafeTensors::deserialize(bytes).map_err(damaged)?;
+        let (meta, names) = parse_meta(&path, bytes)?;
+        let tensors = SafeTensors::deserialize(bytes).map_err(|error| damaged(&path, &error))?;
         let mut precision = Precision::F32;
         let mut weights = Vec::with_capacity(tensors.len());
         for (name, view) in tensors.iter() {
@@ -66,11 +61,11 @@ impl BundleFile {
             }
             let data = values(&view).map_err(|detail| BundleError::Tensor {
                 path: path.clone(),
-                name: name.into(),
+                name: one_line(name),
                 detail,
             })?;
             weights.push(Weight {
-                name: names.to_burn(name),
+                name: names.to_burn(&one_line(name)),
                 shape: view.shape().to_vec(),
                 data,
             });
@@ -86,6 +81,59 @@ impl BundleFile {
     }
 }
 
+/// The bytes of a safetensors file and no more than its header claims: what else may stand at a path (a device, a disk image)
+/// can be larger than the memory.
+///
+/// # Errors
+/// A path that cannot be read; a header that is longer than any of ours.
+pub(super) fn read(path: &Path) -> Result<Vec<u8>, BundleError> {
+    let failed = |source| BundleError::Read {
+        path: path.into(),
+        source,
+    };
+    let mut file = File::open(path).map_err(failed)?;
+    let mut bytes = Vec::new();
+    let mut more = |bytes: &mut Vec<u8>, count: u64| -> io::Result<()> {
+        file.by_ref().take(count).read_to_end(bytes).map(|_| ())
+    };
+    more(&mut bytes, LENGTH as u64).map_err(failed)?;
+    let Ok(length) = <[u8; LENGTH]>::try_from(&bytes[..]).map(u64::from_le_bytes) else {
+        return Ok(bytes);
+    };
+    if length > LONGEST_HEADER {
+        return Err(BundleError::Damaged {
+            path: path.into(),
+            detail: format!("a header of {length} bytes"),
+        });
+    }
+    more(&mut bytes, length).map_err(failed)?;
+    // Where the header is none, that is for the decoder to say.
+    if let Ok(header) = serde_json::from_slice::<Metadata>(&bytes[LENGTH..]) {
+        // One more, so that a file that is too long is found out.
+        let count = (header.data_len() as u64).saturating_add(1);
+        more(&mut bytes, count).map_err(failed)?;
+    }
+    Ok(bytes)
+}
+
+pub(super) fn damaged(path: &Path, error: &safetensors::SafeTensorError) -> BundleError {
+    BundleError::Damaged {
+        path: path.into(),
+        detail: one_line(&error.to_string()),
+    }
+}
+
+/// The metadata of a file with these bytes.
+///
+/// # Errors
+/// Bytes that are no safetensors file, or none of ours.
+pub(super) fn parse_meta(path: &Path, bytes: &[u8]) -> Result<(BundleMeta, Names), BundleError> {
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(|error| damaged(path, &error))?;
+    let entry = header.metadata().as_ref().and_then(|all| all.get(KEY));
+    let entry = entry.ok_or_else(|| BundleError::Foreign { path: path.into() })?;
+    parse_header(entry, path)
+}
+
 /// The metadata in the header entry. The format is looked at first: another format may have other keys.
 fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleError> {
     #[derive(Deserialize)]
@@ -98,7 +146,7 @@ fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleE
     }
     let invalid = |detail: String| BundleError::Header {
         path: path.into(),
-        detail,
+        detail: one_line(&detail),
     };
     let json = |error: serde_json::Error| invalid(error.to_string());
     let Version { format } = serde_json::from_str(entry).map_err(json)?;

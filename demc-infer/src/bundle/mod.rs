@@ -11,6 +11,7 @@
 mod encode;
 mod error;
 mod file;
+mod import;
 pub mod locate;
 pub mod tensors;
 
@@ -142,6 +143,15 @@ impl Bundle {
         }
     }
 
+    /// The bundle that a file of this precision holds: with its weights rounded, on `flex`.
+    ///
+    /// # Errors
+    /// A weight that f16 cannot hold.
+    pub fn rounded(&self, precision: Precision) -> Result<Self, BundleError> {
+        let bytes = self.to_bytes(Names::Burn, precision)?;
+        BundleFile::parse("memory".into(), &bytes)?.into_bundle(&Device::flex())
+    }
+
     /// Loads a run directory (its best weights, else those of the latest checkpoint), a checkpoint directory or a
     /// bundle file, with either set of names, onto `device`. f16 tensors become f32.
     ///
@@ -172,6 +182,8 @@ impl BundleFile {
     }
 }
 
+#[cfg(test)]
+mod hostile;
 #[cfg(test)]
 pub(crate) mod testing;
 #[cfg(test)]

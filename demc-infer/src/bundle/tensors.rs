@@ -34,7 +34,7 @@ pub(super) fn serialize(
 }
 
 /// Little-endian bytes of float32 values.
-pub(super) fn f32_bytes(values: &[f32]) -> Vec<u8> {
+pub(crate) fn f32_bytes(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 
@@ -62,6 +62,15 @@ pub(super) fn values(view: &TensorView<'_>) -> Result<Vec<f32>, String> {
     }
 }
 
+/// Text from a file as it may stand in a message: one line, and nothing that a terminal obeys.
+pub(super) fn one_line(text: &str) -> String {
+    let escape = |c: char| match c.is_control() {
+        true => c.escape_default().collect(),
+        false => c.to_string(),
+    };
+    text.chars().map(escape).collect()
+}
+
 /// The bytes of a file of f32 tensors without metadata: an optimizer's state.
 ///
 /// # Errors
@@ -85,9 +94,10 @@ pub fn to_bytes(weights: &[Weight]) -> Result<Vec<u8>, super::BundleError> {
 /// Bytes that are cut short or no such file; a tensor of another type than f32 and f16 or with NaN or infinity in it. In
 /// words.
 pub fn from_bytes(bytes: &[u8]) -> Result<Vec<Weight>, String> {
-    let file = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
+    let file = SafeTensors::deserialize(bytes).map_err(|error| one_line(&error.to_string()))?;
     let weights = file.tensors().into_iter().map(|(name, view)| {
-        let data = values(&view).map_err(|detail| format!("tensor {name}: {detail}"))?;
+        let data =
+            values(&view).map_err(|detail| format!("tensor {}: {detail}", one_line(&name)))?;
         let shape = view.shape().to_vec();
         Ok(Weight { name, shape, data })
     });

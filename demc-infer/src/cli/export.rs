@@ -1,42 +1,57 @@
 //! `demc-infer export`: weights for other programs, in one file.
 
-use std::fs;
-use std::path::PathBuf;
+use std::env;
+use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
-use demc_infer::{Names, Precision};
+use demc_infer::verify::{Runtime, TOLERANCE, verify};
+use demc_infer::{Bundle, Names, Precision};
 
-use super::{Model, Usage, print};
+use super::{Model, Usage, not_an_input, print};
 
-/// Export a model as one file: weights, configuration, statistics and channel layout.
+/// Variable with the interpreter that `--verify` uses.
+const PYTHON_VARIABLE: &str = "DEMC_PYTHON";
+
+/// Export a model as one file: safetensors with configuration, statistics and channel layout, or an ONNX graph from a
+/// renderer's HDR colour and raw features to HDR colour.
 ///
-/// The file is read back and compared before success is reported. `demc-infer` loads it like a run directory, with
+/// The file is read back and compared before success is reported. `demc-infer` loads safetensors like a run directory, with
 /// either style of names.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer export --model runs/demc -o demc.safetensors
-  demc-infer export --model runs/demc --names torch --precision f16 -o demc-torch.safetensors")]
+  demc-infer export --model runs/demc --names torch --precision f16 -o demc-torch.safetensors
+  demc-infer export --model runs/demc --format onnx --verify -o demc.onnx")]
 pub struct Export {
     #[command(flatten)]
     model: Model,
     /// File format
     #[arg(long, value_enum, default_value = "safetensors")]
     format: Format,
-    /// Names of the tensors: those of Burn or those that PyTorch's load_state_dict expects
+    /// Names of the tensors in a safetensors file: those of Burn or those that PyTorch's load_state_dict expects
     #[arg(long, value_enum, default_value = "burn")]
     names: NamesFlag,
-    /// Type of the weights; batch normalisation stays f32
+    /// Type of the weights. Batch normalisation stays f32, and an ONNX graph computes in f32 either way
     #[arg(long, value_enum, default_value = "f32")]
     precision: PrecisionFlag,
     /// The file to write; an existing one is replaced, but never the model itself
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
+    /// Run the file on synthetic images, in ONNX Runtime or in PyTorch, and compare: 1e-4 is too much
+    #[arg(long)]
+    verify: bool,
+    /// The Python for --verify [default: the variable DEMC_PYTHON, else python3]
+    #[arg(long, value_name = "PYTHON", requires = "verify")]
+    python: Option<PathBuf>,
 }
 
-#[derive(Clone, Copy, ValueEnum)]
+#[derive(Clone, Copy, PartialEq, ValueEnum)]
 enum Format {
+    /// Weights, to be loaded by demc-infer or by PyTorch with the package of python/
     Safetensors,
+    /// A graph, to be run by ONNX Runtime, TensorRT, OpenVINO and others
+    Onnx,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -52,31 +67,72 @@ enum PrecisionFlag {
 }
 
 impl Export {
-    /// Loads, writes, reads back, reports.
+    /// Loads, writes, reads back, reports; runs what was written where that is asked for.
     pub fn run(self) -> anyhow::Result<()> {
         let file = self.model.read()?;
         // Rounding to f16 cannot be taken back: the model must outlive its export.
-        let model = fs::canonicalize(&file.path).ok();
-        if fs::canonicalize(&self.output).is_ok_and(|output| Some(output) == model) {
-            let output = self.output.display();
-            return Err(Usage(format!("output {output} would replace the model")).into());
-        }
-        let bundle = file.into_bundle(&Device::flex())?;
+        not_an_input(&self.output, &[(&file.path, "the model")])?;
         let names = match self.names {
             NamesFlag::Burn => Names::Burn,
             NamesFlag::Torch => Names::Torch,
         };
+        if self.format == Format::Onnx && names == Names::Torch {
+            return Err(Usage("--names is for safetensors; ONNX has none to choose".into()).into());
+        }
         let precision = match self.precision {
             PrecisionFlag::F32 => Precision::F32,
             PrecisionFlag::F16 => Precision::F16,
         };
+        let bundle = file.into_bundle(&Device::flex())?;
+        let output = self.output.display();
         match self.format {
-            Format::Safetensors => bundle.export(&self.output, names, precision)?,
+            Format::Safetensors => {
+                bundle.export(&self.output, names, precision)?;
+                let tensors = bundle.model.weights().len();
+                print(&format!(
+                    "{output}: {tensors} tensors, read back and compared"
+                ))?;
+            }
+            Format::Onnx => {
+                bundle.export_onnx(&self.output, precision)?;
+                print(&format!("{output}: ONNX graph, read back and compared"))?;
+            }
         }
-        let tensors = bundle.model.weights().len();
+        match self.verify {
+            true => self.verify(&bundle.rounded(precision)?),
+            false => Ok(()),
+        }
+    }
+
+    /// Runs the file and prints how far it is from `expected`.
+    fn verify(&self, expected: &Bundle) -> anyhow::Result<()> {
+        let python = match &self.python {
+            Some(python) => python.clone(),
+            None => env::var_os(PYTHON_VARIABLE).map_or_else(|| "python3".into(), PathBuf::from),
+        };
+        let runtime = match self.format {
+            Format::Onnx => Runtime::OnnxRuntime,
+            Format::Safetensors => Runtime::PyTorch,
+        };
+        let found = verify(&self.output, runtime, &python, expected)?;
         print(&format!(
-            "{}: {tensors} tensors, read back and compared",
-            self.output.display()
-        ))
+            "{}, largest deviation: of the batch's largest value / of the value itself, sqrt(x^2 + 0.001)",
+            found.runtime
+        ))?;
+        for deviation in &found.deviations {
+            let [batch, height, width] = deviation.size;
+            let (of_largest, of_value) = (deviation.of_largest, deviation.of_value);
+            print(&format!(
+                "{batch} x {height:>3} x {width:>3}  {of_largest:.1e}  {of_value:.1e}"
+            ))?;
+        }
+        let passes = found.deviations.iter().all(|deviation| deviation.passes());
+        let path: &Path = &self.output;
+        anyhow::ensure!(
+            passes,
+            "{}: deviates by more than {TOLERANCE:e} from what this program computes",
+            path.display()
+        );
+        Ok(())
     }
 }

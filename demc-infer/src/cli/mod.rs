@@ -8,19 +8,21 @@ mod cost;
 mod denoise;
 mod evaluate;
 mod export;
+mod import;
 mod inputs;
 mod inspect;
 mod jobs;
 mod tiling;
 mod writing;
 
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Parser, Subcommand};
 use demc_infer::compute::ComputeFlags;
 use demc_infer::{Bundle, BundleError, BundleFile, device};
 
-/// Use a trained DEMC network: denoise renders, score it, export its weights.
+/// Use a trained DEMC network: denoise renders, score it, move its weights out and in.
 #[derive(Parser)]
 #[command(
     version,
@@ -39,6 +41,7 @@ enum Command {
     Check(check::Check),
     Evaluate(evaluate::Evaluate),
     Export(export::Export),
+    Import(import::Import),
     Inspect(inspect::Inspect),
 }
 
@@ -55,6 +58,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         Command::Check(command) => command.run(),
         Command::Evaluate(command) => command.run(),
         Command::Export(command) => command.run(),
+        Command::Import(command) => command.run(),
         Command::Inspect(command) => command.run(),
     }
 }
@@ -121,6 +125,20 @@ impl Clamped {
             eprintln!("note: {samples} negative radiance sample(s) in {images} image(s) set to 0");
         }
     }
+}
+
+/// Refuses an output that would replace an input: `inputs` are files and what a message calls them.
+fn not_an_input(output: &Path, inputs: &[(&Path, &str)]) -> Result<(), Usage> {
+    let Ok(target) = fs::canonicalize(output) else {
+        return Ok(());
+    };
+    for (input, name) in inputs {
+        if fs::canonicalize(input).is_ok_and(|input| input == target) {
+            let output = output.display();
+            return Err(Usage(format!("output {output} would replace {name}")));
+        }
+    }
+    Ok(())
 }
 
 /// Writes `text` and a line end to stdout for `-`, else to a file.

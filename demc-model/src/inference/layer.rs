@@ -1,4 +1,4 @@
-//! Weights as the kernels take them: slices of the module's own tensors, or folded copies.
+//! Weights where nothing is differentiated: slices of the module's own tensors, or folded copies.
 
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
@@ -10,7 +10,7 @@ use burn::tensor::Tensor;
 ///
 /// A batch normalisation with its running statistics is `scale * x + shift` for each channel, and so is what a
 /// convolution does after its products: the two become one convolution, and the normalisation costs nothing.
-pub(super) struct Layer {
+pub struct Layer {
     weight: Values,
     bias: Values,
 }
@@ -40,8 +40,14 @@ impl Values {
 }
 
 impl Layer {
-    /// A convolution and what normalises its output. Weight `[out, in, h, w]`.
-    pub(super) fn conv(conv: &Conv2d, norm: Option<&BatchNorm>) -> Self {
+    /// A convolution and what normalises its output, on `flex`.
+    ///
+    /// # Shapes
+    /// Weight `[out, in, h, w]`.
+    ///
+    /// # Panics
+    /// On another device.
+    pub fn conv(conv: &Conv2d, norm: Option<&BatchNorm>) -> Self {
         let bias = conv.bias.as_ref().expect("a convolution has a bias");
         let plain = Layer {
             weight: Values::of(conv.weight.val()),
@@ -55,8 +61,14 @@ impl Layer {
         })
     }
 
-    /// A deconvolution and what normalises its output. Weight `[in, out, 4, 4]`.
-    pub(super) fn deconv(deconv: &ConvTranspose2d, norm: Option<&BatchNorm>) -> Self {
+    /// A deconvolution and what normalises its output, on `flex`.
+    ///
+    /// # Shapes
+    /// Weight `[in, out, 4, 4]`.
+    ///
+    /// # Panics
+    /// On another device.
+    pub fn deconv(deconv: &ConvTranspose2d, norm: Option<&BatchNorm>) -> Self {
         let bias = deconv.bias.as_ref().expect("a deconvolution has a bias");
         let plain = Layer {
             weight: Values::of(deconv.weight.val()),
@@ -74,16 +86,9 @@ impl Layer {
     /// `scale_weight` multiplies what gives an output channel with that channel's scale.
     fn folded(self, norm: Option<&BatchNorm>, scale_weight: impl Fn(&mut [f32], &[f32])) -> Self {
         let Some(norm) = norm else { return self };
-        let [gamma, beta] = [&norm.gamma, &norm.beta].map(|p| Values::of(p.val()));
-        let [mean, variance] =
-            [&norm.running_mean, &norm.running_var].map(|state| Values::of(state.value()));
-        let statistics = gamma.as_slice().iter().zip(variance.as_slice());
-        let scale: Vec<f32> = statistics
-            .map(|(gamma, variance)| {
-                let deviation = (f64::from(*variance) + norm.epsilon).sqrt();
-                (f64::from(*gamma) / deviation) as f32
-            })
-            .collect();
+        let beta = Values::of(norm.beta.val());
+        let mean = Values::of(norm.running_mean.value());
+        let scale = scale_of(norm);
         let mut weight = self.weight().to_vec();
         scale_weight(&mut weight, &scale);
         let bias = (self.bias().iter())
@@ -99,17 +104,33 @@ impl Layer {
     }
 
     /// In the layout of weight files.
-    pub(super) fn weight(&self) -> &[f32] {
+    pub fn weight(&self) -> &[f32] {
         self.weight.as_slice()
     }
 
     /// One an output channel.
-    pub(super) fn bias(&self) -> &[f32] {
+    pub fn bias(&self) -> &[f32] {
         self.bias.as_slice()
     }
 
     /// Output channels.
-    pub(super) fn outputs(&self) -> usize {
+    pub fn outputs(&self) -> usize {
         self.bias().len()
     }
+}
+
+/// What a batch normalisation with its running statistics multiplies each channel by: `gamma / sqrt(variance + epsilon)`.
+///
+/// # Panics
+/// On another device than `flex`.
+pub fn scale_of(norm: &BatchNorm) -> Vec<f32> {
+    let gamma = Values::of(norm.gamma.val());
+    let variance = Values::of(norm.running_var.value());
+    let statistics = gamma.as_slice().iter().zip(variance.as_slice());
+    statistics
+        .map(|(gamma, variance)| {
+            let deviation = (f64::from(*variance) + norm.epsilon).sqrt();
+            (f64::from(*gamma) / deviation) as f32
+        })
+        .collect()
 }

@@ -35,10 +35,10 @@ use crate::ops::Ops;
 use band::TILE_ROWS;
 use encoder::DEEPEST_BANDED;
 use images::Images;
-use layer::Layer;
 use step::{Again, LEVELS_IN_STEP};
 
 pub use estimate::{peak_bytes, reusable_bytes};
+pub use layer::{Layer, scale_of};
 
 /// Pixels of the full resolution in a band, for each thread: enough work to wake threads for, little enough for caches.
 const BAND_PIXELS: usize = 20 << 10;

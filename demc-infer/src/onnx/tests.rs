@@ -1,0 +1,100 @@
+//! What can be said about a graph without a runtime; `tests/tests/onnx_live.rs` runs it in one.
+
+use std::collections::HashSet;
+
+use demc_model::Variant;
+
+use super::proto::{FLOAT16, Node};
+use super::*;
+use crate::bundle::testing::bundle;
+
+fn graph(variant: Variant, precision: Precision) -> proto::Graph {
+    let model = bundle(variant).onnx(precision).expect("a graph");
+    model.graph.expect("there is one")
+}
+
+fn count(graph: &proto::Graph, op: &str) -> usize {
+    graph.node.iter().filter(|node| node.op_type == op).count()
+}
+
+#[test]
+fn every_value_is_made_once_and_before_it_is_taken() {
+    for variant in Variant::ALL {
+        for precision in [Precision::F32, Precision::F16] {
+            let graph = graph(variant, precision);
+            let mut known: HashSet<&str> = graph.input.iter().map(|v| v.name.as_str()).collect();
+            for constant in &graph.initializer {
+                assert!(known.insert(&constant.name), "{} twice", constant.name);
+            }
+            for Node { input, output, .. } in &graph.node {
+                for name in input {
+                    assert!(known.contains(name.as_str()), "{name} before it is made");
+                }
+                assert!(known.insert(&output[0]), "{} twice", output[0]);
+            }
+            assert!(known.contains(OUTPUT));
+            let taken: HashSet<&String> = graph.node.iter().flat_map(|n| &n.input).collect();
+            for constant in &graph.initializer {
+                assert!(taken.contains(&constant.name), "{} unused", constant.name);
+            }
+        }
+    }
+}
+
+/// DEMC in the released reading: 4 blocks, 2 + 2 + 3 + 3 + 3 convolutions an encoder, the latent, 5 skip fusions, the head.
+#[test]
+fn layers_are_those_of_the_network_and_no_normalisation_is_left() {
+    let graph = graph(Variant::Demc, Precision::F32);
+    assert_eq!(count(&graph, "Conv"), 4 + 13 + 13 + 1 + 5 + 1);
+    assert_eq!(count(&graph, "ConvTranspose"), 5);
+    // The feature encoder's last level has nothing below it.
+    assert_eq!(count(&graph, "MaxPool"), 4 + 5);
+    assert_eq!(count(&graph, "Concat"), 5);
+    assert_eq!(count(&graph, "BatchNormalization"), 0);
+    assert_eq!(count(&graph, "Cast"), 0);
+}
+
+#[test]
+fn f16_halves_what_kernels_take_and_nothing_else_is_f16() {
+    let [full, half] =
+        [Precision::F32, Precision::F16].map(|precision| graph(Variant::Demc, precision));
+    let bytes = |graph: &proto::Graph, dims: usize| -> usize {
+        let kernels = graph.initializer.iter();
+        kernels
+            .filter(|t| (t.dims.len() == dims) && !t.name.ends_with(".scale"))
+            .filter(|t| !t.name.starts_with("features_"))
+            .map(|t| t.raw_data.len())
+            .sum()
+    };
+    assert_eq!(2 * bytes(&half, 4), bytes(&full, 4));
+    assert_eq!(bytes(&half, 1), bytes(&full, 1));
+    let halves = half.initializer.iter().filter(|t| t.data_type == FLOAT16);
+    assert_eq!(halves.count(), count(&half, "Cast"));
+}
+
+#[test]
+fn equal_bundles_give_equal_bytes() {
+    let bytes = || {
+        let model = bundle(Variant::Semc).onnx(Precision::F16).expect("a graph");
+        model.encode_to_vec()
+    };
+    assert_eq!(bytes(), bytes());
+}
+
+#[test]
+fn a_weight_beyond_f16_is_named_and_nothing_is_written() {
+    let mut bundle = bundle(Variant::Demc);
+    let mut weights = bundle.model.weights();
+    weights[0].data[0] = 1e6;
+    let name = weights[0].name.clone();
+    let mut weights = demc_model::Weights::new(weights);
+    let device = burn::tensor::Device::flex();
+    bundle.model = bundle.meta.model.load(&mut weights, &device).expect("fits");
+    let folder = tempfile::tempdir().expect("directory");
+    let path = folder.path().join("x.onnx");
+    let error = bundle.export_onnx(&path, Precision::F16).expect_err("f16");
+    assert!(error.to_string().contains(&name), "{error}");
+    assert!(!path.exists());
+    bundle.export_onnx(&path, Precision::F32).expect("f32");
+    assert!(path.exists());
+}

@@ -1,0 +1,46 @@
+"""Runs an exported file on the images of a folder: `KIND FILE FOLDER`, shapes as JSON from stdin.
+
+Image i is `i.color` and `i.features`, raw float32; the answer is `i.output`. Exit code 3: a package is missing.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+# With `-c` the first entry is the working directory: no module of the user's shall be taken for a package.
+sys.path = [entry for entry in sys.path if entry]
+
+
+def onnx(file):
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    version = f"ONNX Runtime {onnxruntime.__version__}"
+    return version, lambda color, features: session.run(["output"], {"color": color, "features": features})[0]
+
+
+def torch(file):
+    import demc
+    import torch
+
+    bundle = demc.load(file)
+    version = f"PyTorch {torch.__version__}"
+    return version, lambda color, features: numpy.stack([bundle.denoise(*image) for image in zip(color, features)])
+
+
+kind, file, folder = sys.argv[1:]
+try:
+    import numpy
+
+    version, run = {"onnx": onnx, "torch": torch}[kind](file)
+except ImportError as error:
+    print(error, file=sys.stderr)
+    sys.exit(3)
+for i, (batch, height, width) in enumerate(json.load(sys.stdin)):
+    path = Path(folder, str(i))
+    color, features = (
+        numpy.fromfile(path.with_suffix(suffix), "<f4").reshape(batch, -1, height, width)
+        for suffix in (".color", ".features")
+    )
+    run(color, features).astype("<f4").tofile(path.with_suffix(".output"))
+print(version)

@@ -1,0 +1,138 @@
+//! What the tests share that need a Python: the interpreter, and networks with random weights.
+#![allow(dead_code, reason = "each test uses its part")]
+
+use std::ffi::OsStr;
+use std::fs;
+use std::io::Write;
+use std::ops::Range;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use burn::tensor::Device;
+use demc_data::{ChannelLayout, FeatureStats, Normalizer};
+use demc_infer::{Bundle, BundleMeta};
+use demc_model::{Detail, Head, ModelConfig, Reading, Variant, Weight, Weights};
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+
+/// Feature channels.
+pub const FEATURES: usize = 12;
+/// Base width of random networks.
+const WIDTH: usize = 4;
+
+/// A Python interpreter.
+pub struct Python(String);
+
+impl Python {
+    /// The one named by `DEMC_PYTHON`, else `python3`, if it can import these `packages`. Else says that the test is skipped, or
+    /// fails it where the variable `required` is 1.
+    pub fn with(packages: &str, install: &str, required: &str) -> Option<Self> {
+        let python = Python(std::env::var("DEMC_PYTHON").unwrap_or_else(|_| "python3".into()));
+        let Err(reason) = python.check(packages, install) else {
+            return Some(python);
+        };
+        assert!(
+            std::env::var(required).as_deref() != Ok("1"),
+            "{required}=1, but {reason}"
+        );
+        // Not `println!`, which the test harness swallows.
+        writeln!(std::io::stderr(), "skipped: {reason}").expect("stderr can be written");
+        None
+    }
+
+    /// Whether it has what a test needs; else why not.
+    fn check(&self, packages: &str, install: &str) -> Result<(), String> {
+        let Python(program) = self;
+        let output = self
+            .run(["-c", &format!("import {packages}")])
+            .map_err(|e| format!("{program} does not run: {e}"))?;
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        let last = stderr.lines().last().unwrap_or_default();
+        match output.status.success() {
+            true => Ok(()),
+            false => Err(format!(
+                "{program} cannot import {packages} (pip install {install}): {last}"
+            )),
+        }
+    }
+
+    /// The program.
+    pub fn path(&self) -> &Path {
+        Path::new(&self.0)
+    }
+
+    /// Runs it, to success.
+    pub fn succeed(&self, arguments: &[&Path]) {
+        let Output { status, stderr, .. } = self.run(arguments).expect("it ran before");
+        let stderr = String::from_utf8_lossy(&stderr);
+        assert!(status.success(), "{arguments:?}: {stderr}");
+    }
+
+    /// Runs it.
+    pub fn run<A: AsRef<OsStr>>(
+        &self,
+        arguments: impl IntoIterator<Item = A>,
+    ) -> std::io::Result<Output> {
+        // From a directory without a package `demc`, so that the installed one is found.
+        Command::new(&self.0)
+            .args(arguments)
+            .current_dir(env!("CARGO_MANIFEST_DIR"))
+            .output()
+    }
+}
+
+/// A network with its initial weights moved at random by `move_by`, so that no bias is zero and no running statistic trivial. Up
+/// rather than down, so that ReLUs stay open: the further, the larger the outputs and their range.
+pub fn random_bundle(
+    variant: Variant,
+    reading: Reading,
+    move_by: Range<f32>,
+    rng: &mut ChaCha8Rng,
+) -> Bundle {
+    let config = ModelConfig {
+        variant,
+        reading,
+        width: WIDTH,
+        head: Head::Grey,
+        detail: Detail::default(),
+    };
+    let device = Device::flex();
+    let mut weights = config.init(rng, [0.5, 0.4, 0.3], &device).weights();
+    for Weight { data, .. } in &mut weights {
+        data.iter_mut()
+            .for_each(|value| *value += rng.random_range(move_by.clone()));
+    }
+    let normalizer = Normalizer {
+        gamma: 2.2,
+        features: FeatureStats {
+            mean: std::array::from_fn(|channel| 0.3 * channel as f32 - 1.0),
+            std: std::array::from_fn(|channel| 0.4 + 0.5 * channel as f32),
+        },
+        flat_color: [0.5, 0.4, 0.3],
+    };
+    let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
+    Bundle {
+        model: config
+            .load(&mut Weights::new(weights), &device)
+            .expect("its own weights"),
+        meta: BundleMeta::new(config, normalizer, layout, 0),
+    }
+}
+
+/// Random values.
+pub fn uniform(low: f32, high: f32, count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    (0..count).map(|_| rng.random_range(low..high)).collect()
+}
+
+/// Writes raw float32.
+pub fn write_floats<'a>(path: &Path, values: impl IntoIterator<Item = &'a f32>) {
+    let bytes: Vec<u8> = values.into_iter().flat_map(|v| v.to_le_bytes()).collect();
+    fs::write(path, bytes).expect("a writable temporary directory");
+}
+
+/// Reads them.
+pub fn read_floats(path: &Path) -> Vec<f32> {
+    let bytes = fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    let words = bytes.as_chunks().0.iter();
+    words.map(|word| f32::from_le_bytes(*word)).collect()
+}

@@ -1,0 +1,185 @@
+//! Exported ONNX graphs in the ONNX Runtime of this machine: every network, f32 and f16, at sizes that nothing in a file
+//! names, against this program's own images.
+//!
+//! Needs a Python (`DEMC_PYTHON`, default `python3`) with `pip install numpy onnx onnxruntime`. Without one the test says that
+//! it was skipped; with `DEMC_REQUIRE_ONNX=1` it fails.
+
+mod live;
+#[path = "parity/tensors.rs"]
+#[allow(dead_code, reason = "each test uses its part")]
+mod tensors;
+
+use std::fs;
+use std::path::Path;
+
+use burn::tensor::Device;
+use demc_data::Frame;
+use demc_infer::{Bundle, Precision};
+use demc_model::{Reading, Variant, Weights};
+use live::{FEATURES, Python, random_bundle, uniform};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use tempfile::TempDir;
+use tensors::{Tolerance, assert_close};
+
+/// Images, height and width.
+const SIZES: [[usize; 3]; 6] = [
+    [1, 32, 32],
+    [1, 32, 96],
+    [1, 96, 160],
+    [1, 224, 32],
+    [2, 96, 64],
+    [3, 32, 160],
+];
+
+/// Radiance of an image's largest value, about.
+const LARGEST: f32 = 2.0;
+
+const PRECISIONS: [(Precision, &str); 2] = [(Precision::F32, "f32"), (Precision::F16, "f16")];
+
+/// What the project promises against the largest value of the batch.
+const OF_LARGEST: Tolerance = Tolerance {
+    absolute: 0.0,
+    of_largest: 1e-4,
+    of_value: 0.0,
+};
+
+/// And of each value, down to the 0.03 below which RelMSE (Eq. 5, epsilon 0.001) no longer looks at shares of it.
+const OF_VALUE: Tolerance = Tolerance {
+    absolute: 1e-4 * 0.031_622_8,
+    of_largest: 0.0,
+    of_value: 1e-4,
+};
+
+#[test]
+fn onnx_runtime_computes_what_this_program_does() {
+    let packages = "numpy, onnx, onnxruntime";
+    let install = "numpy onnx onnxruntime";
+    let Some(python) = Python::with(packages, install, "DEMC_REQUIRE_ONNX") else {
+        return;
+    };
+    // Fresh weights and inputs at each run; the seed stands in every failure.
+    let seed: u64 = rand::random();
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let folder = TempDir::new().expect("a temporary directory");
+    let folder = folder.path();
+
+    let mut bundles: Vec<(String, Bundle)> = Vec::new();
+    for variant in Variant::ALL {
+        for reading in Reading::ALL {
+            let bundle = random_bundle(variant, reading, -0.05..0.06, &mut rng);
+            let bundle = scaled(&bundle, &mut rng);
+            for (precision, suffix) in PRECISIONS {
+                let [variant, reading] = [variant.spec().name, reading.spec().name];
+                let name = format!("{variant}-{reading}-{suffix}");
+                let path = folder.join(&name).with_extension("onnx");
+                bundle.export_onnx(&path, precision).expect("exported");
+                bundles.push((name, bundle.rounded(precision).expect("rounded")));
+            }
+        }
+    }
+    let frames: Vec<Vec<Frame>> = SIZES
+        .iter()
+        .map(|size| frames(*size, &bundles[0].1, &mut rng))
+        .collect();
+    for (case, frames) in frames.iter().enumerate() {
+        write(&folder.join(format!("{case}.color")), frames, |frame| {
+            &frame.color
+        });
+        write(&folder.join(format!("{case}.features")), frames, |frame| {
+            &frame.features
+        });
+    }
+    fs::write(folder.join("sizes.json"), format!("{SIZES:?}")).expect("written");
+
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("onnx/check.py");
+    let run = python
+        .run([script.as_path(), folder])
+        .expect("it ran before");
+    assert!(
+        run.status.success(),
+        "seed {seed}: {}",
+        String::from_utf8_lossy(&run.stderr)
+    );
+
+    for (name, bundle) in &bundles {
+        let mut worst = [0.0f32; 2];
+        for (case, frames) in frames.iter().enumerate() {
+            let what = format!("{name}, {:?}, seed {seed}", SIZES[case]);
+            let expected: Vec<f32> = frames
+                .iter()
+                .flat_map(|frame| bundle.denoise(frame).expect("denoised"))
+                .collect();
+            let lit = expected.iter().filter(|&&v| v > 1e-3).count();
+            assert!(lit > expected.len() / 2, "{what}: only {lit} are lit");
+            let found = read(&folder.join(format!("{name}.{case}.output")));
+            for (worst, tolerance) in worst.iter_mut().zip([OF_LARGEST, OF_VALUE]) {
+                let share = assert_close(&what, &found, &expected, tolerance);
+                *worst = worst.max(1e-4 * share);
+            }
+        }
+        let [of_largest, of_value] = worst;
+        println!("{name}: {of_largest:.1e} of the largest value, {of_value:.1e} of each");
+    }
+}
+
+/// The same with an output convolution that only adds, and makes the largest value of an image [`LARGEST`]: a random network's
+/// outputs are of any order, and black wherever it subtracts.
+fn scaled(bundle: &Bundle, rng: &mut ChaCha8Rng) -> Bundle {
+    let frame = &frames([1, 96, 96], bundle, rng)[0];
+    let with_head = |change: &dyn Fn(f32) -> f32| {
+        let mut weights = bundle.model.weights();
+        let head = weights
+            .iter_mut()
+            .filter(|w| w.name.starts_with("decoder.head."));
+        head.for_each(|weight| weight.data.iter_mut().for_each(|x| *x = change(*x)));
+        let config = bundle.meta.model;
+        let model = config.load(&mut Weights::new(weights), &Device::flex());
+        Bundle {
+            model: model.expect("its own weights"),
+            meta: bundle.meta.clone(),
+        }
+    };
+    let image = with_head(&f32::abs).denoise(frame).expect("denoised");
+    let largest = image.iter().fold(0.0f32, |m, x| m.max(*x));
+    let factor = (LARGEST / largest).powf(1.0 / bundle.meta.normalizer.gamma);
+    with_head(&|x| x.abs() * factor)
+}
+
+/// Noisy frames with black pixels, whose features spread around the bundle's statistics.
+fn frames([batch, height, width]: [usize; 3], bundle: &Bundle, rng: &mut ChaCha8Rng) -> Vec<Frame> {
+    let pixels = height * width;
+    let statistics = &bundle.meta.normalizer.features;
+    let mut frame = || {
+        let color = uniform(-0.3, 1.6, 3 * pixels, rng).into_iter();
+        let mut features = uniform(-1.7, 1.7, FEATURES * pixels, rng);
+        for (channel, plane) in features.chunks_exact_mut(pixels).enumerate() {
+            let (mean, std) = (statistics.mean[channel], statistics.std[channel]);
+            plane.iter_mut().for_each(|x| *x = mean + std * *x);
+        }
+        Frame {
+            name: "random".into(),
+            width,
+            height,
+            // What is below 0 stays: the graph clamps, as the program does.
+            color: color.map(|x| x * x * x).collect(),
+            features,
+            reference: None,
+            mask: None,
+            clamped: 0,
+        }
+    };
+    (0..batch).map(|_| frame()).collect()
+}
+
+fn write(path: &Path, frames: &[Frame], values: impl Fn(&Frame) -> &Vec<f32>) {
+    let values = frames.iter().flat_map(|frame| values(frame).iter());
+    let bytes: Vec<u8> = values.flat_map(|value| value.to_le_bytes()).collect();
+    fs::write(path, bytes).expect("a writable temporary directory");
+}
+
+fn read(path: &Path) -> Vec<f32> {
+    let bytes = fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    let words = bytes.as_chunks().0.iter();
+    words.map(|word| f32::from_le_bytes(*word)).collect()
+}

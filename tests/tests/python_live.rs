@@ -1,0 +1,194 @@
+//! What users do in Python with what `demc-infer` writes: `export --verify`, weights that were trained further and come back, and
+//! the programs in `python/examples`.
+//!
+//! Needs a Python (`DEMC_PYTHON`, default `python3`) with `pip install numpy onnxruntime OpenEXR ./python`. Tests without one say
+//! that they were skipped; with `DEMC_REQUIRE_ONNX=1` or `DEMC_REQUIRE_TORCH=1` they fail.
+
+mod live;
+#[allow(dead_code, reason = "each test uses its part")]
+#[path = "parity/tensors.rs"]
+mod tensors;
+
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use burn::tensor::Device;
+use demc_data::Frame;
+use demc_data::exr::ExrFile;
+use demc_data::plane::Plane;
+use demc_infer::verify::{Runtime, verify};
+use demc_infer::{Bundle, BundleError, BundleFile, Names, Precision};
+use demc_model::{Reading, Variant};
+use live::{FEATURES, Python, random_bundle, read_floats, uniform, write_floats};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use tempfile::TempDir;
+use tensors::{Tolerance, assert_close};
+
+/// How far random networks are moved from where they start.
+const MOVE_BY: Range<f32> = -0.05..0.06;
+/// What the project promises, against the output's largest value.
+const TOLERANCE: Tolerance = Tolerance {
+    absolute: 0.0,
+    of_largest: 1e-4,
+    of_value: 0.0,
+};
+
+fn onnx() -> Option<Python> {
+    let packages = "numpy, onnxruntime, OpenEXR";
+    Python::with(packages, "numpy onnxruntime OpenEXR", "DEMC_REQUIRE_ONNX")
+}
+
+fn torch() -> Option<Python> {
+    let packages = "torch, demc, OpenEXR";
+    Python::with(packages, "./python OpenEXR", "DEMC_REQUIRE_TORCH")
+}
+
+fn repository() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+/// The model that `demc-infer` comes with.
+fn shipped() -> Bundle {
+    let path = repository().join("models/demc.safetensors");
+    Bundle::load(&path, &Device::flex()).expect("the model loads")
+}
+
+#[test]
+fn verify_passes_what_onnx_runtime_computes_and_no_other_model() {
+    let Some(python) = onnx() else { return };
+    let folder = TempDir::new().expect("a temporary directory");
+    let path = folder.path().join("x.onnx");
+    let bundle = shipped();
+    for precision in [Precision::F32, Precision::F16] {
+        bundle.export_onnx(&path, precision).expect("exported");
+        let expected = bundle.rounded(precision).expect("rounded");
+        let found = verify(&path, Runtime::OnnxRuntime, python.path(), &expected).expect("run");
+        assert!(
+            found.runtime.starts_with("ONNX Runtime "),
+            "{}",
+            found.runtime
+        );
+        assert!(found.deviations.iter().all(|d| d.passes()), "{found:?}");
+    }
+    // A statistic that is off by a hundredth of a deviation is seen.
+    let mut other = bundle;
+    other.meta.normalizer.features.mean[3] += 0.01 * other.meta.normalizer.features.std[3];
+    let found = verify(&path, Runtime::OnnxRuntime, python.path(), &other).expect("run");
+    assert!(!found.deviations.iter().any(|d| d.passes()), "{found:?}");
+}
+
+#[test]
+fn verify_passes_what_pytorch_computes_with_either_style_of_names() {
+    let Some(python) = torch() else { return };
+    let folder = TempDir::new().expect("a temporary directory");
+    let path = folder.path().join("x.safetensors");
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let bundle = random_bundle(Variant::Demc, Reading::Released, MOVE_BY, &mut rng);
+    for names in [Names::Torch, Names::Burn] {
+        bundle
+            .export(&path, names, Precision::F32)
+            .expect("exported");
+        let found = verify(&path, Runtime::PyTorch, python.path(), &bundle).expect("run");
+        assert!(found.deviations.iter().all(|d| d.passes()), "{found:?}");
+    }
+}
+
+#[test]
+fn weights_trained_in_pytorch_come_back() {
+    let Some(python) = torch() else { return };
+    const SIDE: usize = 64;
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    for variant in Variant::ALL {
+        let bundle = random_bundle(variant, Reading::Released, MOVE_BY, &mut rng);
+        let statistics = &bundle.meta.normalizer.features;
+        let features = uniform(-1.0, 1.0, FEATURES * SIDE * SIDE, &mut rng).into_iter();
+        let raw = features.enumerate().map(|(i, z)| {
+            let channel = i / (SIDE * SIDE);
+            statistics.mean[channel] + statistics.std[channel] * z
+        });
+        let frame = Frame {
+            name: "random".into(),
+            width: SIDE,
+            height: SIDE,
+            color: uniform(0.0, 1.0, 3 * SIDE * SIDE, &mut rng),
+            features: raw.collect(),
+            reference: None,
+            mask: None,
+            clamped: 0,
+        };
+        let folder = TempDir::new().expect("a temporary directory");
+        let file = |name: &str| folder.path().join(name);
+        let [exported, color, features, weights, output] =
+            ["exported", "color", "features", "weights", "output"].map(file);
+        bundle
+            .export(&exported, Names::Torch, Precision::F32)
+            .expect("exported");
+        write_floats(&color, &frame.color);
+        write_floats(&features, &frame.features);
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("torch/tune.py");
+        let side = PathBuf::from(SIDE.to_string());
+        python.succeed(&[
+            &script, &exported, &color, &features, &side, &weights, &output,
+        ]);
+
+        let error = BundleFile::import(&weights, None).expect_err("save_file drops the header");
+        assert!(matches!(error, BundleError::Foreign { .. }), "{error}");
+        let imported = BundleFile::import(&weights, Some(bundle.meta.clone())).expect("imported");
+        let tuned = imported.into_bundle(&Device::flex()).expect("fits");
+        assert_ne!(tuned.model.weights(), bundle.model.weights());
+        let found = tuned.denoise(&frame).expect("denoised");
+        let name = variant.spec().name;
+        assert_close(name, &found, &read_floats(&output), TOLERANCE);
+        let before = bundle.denoise(&frame).expect("denoised");
+        let moved = found
+            .iter()
+            .zip(&before)
+            .any(|(a, b)| (a - b).abs() > 0.01 * b);
+        assert!(moved, "{variant:?}: the step changed nothing");
+    }
+}
+
+/// The program `script` of `python/examples` with the file `model`, against this one, on an image of the sample.
+fn example(python: &Python, script: &str, model: &Path, bundle: &Bundle) {
+    let source = repository().join("data/sample/test/gen-table-test-1.exr");
+    let target = model.with_file_name("out.exr");
+    let script = repository().join("python/examples").join(script);
+    python.succeed(&[&script, model, &source, &target]);
+    let frame = demc_data::read_frame(&source, &bundle.meta.layout).expect("a frame");
+    let expected = bundle.denoise(&frame).expect("denoised");
+    let planes = ExrFile::open(&target)
+        .expect("an EXR")
+        .read(&["R", "G", "B"]);
+    let found: Vec<f32> = planes
+        .expect("RGB")
+        .iter()
+        .flat_map(Plane::to_f32)
+        .collect();
+    assert_close(&script.display().to_string(), &found, &expected, TOLERANCE);
+}
+
+#[test]
+fn the_onnx_example_denoises_the_sample() {
+    let Some(python) = onnx() else { return };
+    let folder = TempDir::new().expect("a temporary directory");
+    let model = folder.path().join("demc.onnx");
+    let bundle = shipped();
+    bundle
+        .export_onnx(&model, Precision::F16)
+        .expect("exported");
+    let rounded = bundle.rounded(Precision::F16).expect("rounded");
+    example(&python, "onnx_denoise.py", &model, &rounded);
+}
+
+#[test]
+fn the_torch_example_denoises_the_sample() {
+    let Some(python) = torch() else { return };
+    let folder = TempDir::new().expect("a temporary directory");
+    let model = folder.path().join("demc.safetensors");
+    let bundle = shipped();
+    bundle
+        .export(&model, Names::Torch, Precision::F32)
+        .expect("exported");
+    example(&python, "torch_denoise.py", &model, &bundle);
+}

@@ -1,0 +1,29 @@
+"""Trains a bundle one step and saves its weights as PyTorch users do: `BUNDLE COLOR FEATURES SIDE WEIGHTS OUTPUT`.
+
+COLOR, FEATURES and OUTPUT are raw float32 of a square image; OUTPUT is what the trained network makes of it.
+"""
+
+import sys
+
+import demc
+import numpy as np
+import torch
+from safetensors.torch import save_file
+
+path, color, features, side, weights, output = sys.argv[1:]
+color, features = (np.fromfile(name, "<f4").reshape(-1, int(side), int(side)) for name in (color, features))
+bundle = demc.load(path)
+before = {name: weight.clone() for name, weight in bundle.model.state_dict().items()}
+
+model = bundle.model.train()
+adam = torch.optim.Adam(model.parameters(), lr=1e-2)
+hdr, raw = (torch.from_numpy(image)[None] for image in (color, features))
+out = model(demc.gamma_from_hdr(hdr, bundle.gamma), bundle.features_z_from_raw(raw))
+demc.rel_mse(demc.hdr_from_gamma(out, bundle.gamma), torch.full_like(hdr, 0.2)).backward()
+adam.step()
+model.eval()
+
+changed = [name for name, weight in model.state_dict().items() if not torch.equal(weight, before[name])]
+assert any(name.endswith("running_var") for name in changed) and len(changed) > len(before) / 2, changed
+save_file(model.state_dict(), weights)
+bundle.denoise(color, features).astype("<f4").tofile(output)
