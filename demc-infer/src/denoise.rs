@@ -192,7 +192,7 @@ impl Bundle {
     }
 
     /// Where the model is.
-    fn device(&self) -> Device {
+    pub(crate) fn device(&self) -> Device {
         let devices = self.model.devices();
         devices.first().expect("every network has weights").clone()
     }

@@ -2,6 +2,7 @@
 //!
 //! A [`Bundle`] is a network together with everything that its numbers depend on: configuration, normalisation
 //! statistics, channel layout, training step. [`bundle`] is the one writer and the one reader of its file.
+//! [`onnx`] writes the network for other runtimes, [`verify`](mod@verify) compares what those make of it with what this program does.
 //! `Bundle::denoise` ([`denoise`]) takes a frame to its denoised image, over [`padding`]; [`evaluate`] scores the
 //! result against a reference, [`picture`] makes it visible. Training validates with exactly this code.
 #![forbid(unsafe_code)]
