@@ -131,7 +131,7 @@ impl ChannelLayout {
     pub fn from_toml(name: &str, text: &str) -> Result<Self, Error> {
         let layout: Self =
             toml::from_str(text).map_err(|error| mistake(name, one_line(&error, text)))?;
-        match layout.problems() {
+        match layout.validate() {
             problems if problems.is_empty() => Ok(layout),
             problems => Err(mistake(name, problems.join("; "))),
         }
@@ -148,7 +148,7 @@ impl ChannelLayout {
     }
 
     /// Everything that is wrong with this layout, one phrase each.
-    fn problems(&self) -> Vec<String> {
+    pub fn validate(&self) -> Vec<String> {
         let mut problems = Vec::new();
         for (buffer, names, missing) in self.features() {
             if names.is_none() && missing == Missing::Error {
@@ -175,6 +175,9 @@ impl ChannelLayout {
         for name in all {
             if !seen.insert(name) {
                 problems.push(format!("channel {name:?} is named twice"));
+            }
+            if name.contains(char::is_control) {
+                problems.push(format!("channel {name:?} is no name"));
             }
         }
         problems

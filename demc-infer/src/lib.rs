@@ -37,6 +37,7 @@
 //!   statistics, channel layout, training step. The one writer and the one reader of its file.
 //! - [`denoise`]: a frame to its denoised image, of any size: over [`padding`] and [`tiles`], within the [`memory`] that is there.
 //! - [`guard`]: what is refused and what is warned of, when an image is not what the network was trained on.
+//! - [`onnx`] writes the network for other runtimes, [`verify`](mod@verify) compares what those make of it with what this crate does.
 //! - [`evaluate`]: scores against a reference. [`picture`]: images to look at.
 //! - [`device`], [`compute`]: what computes, and how.
 //!

@@ -1,4 +1,4 @@
-//! `demc-infer`: denoise, evaluate, export, inspect. See `cli`.
+//! `demc-infer`: denoise, evaluate, export, import, inspect. See `cli`.
 #![forbid(unsafe_code)]
 
 mod cli;

@@ -278,7 +278,7 @@ fn an_export_that_cannot_be_written_is_named() {
 fn no_arguments_show_the_commands() {
     let outcome = demc_infer([""; 0]);
     assert_eq!(outcome.code, 2);
-    for command in ["denoise", "evaluate", "export", "inspect"] {
+    for command in ["denoise", "evaluate", "export", "import", "inspect"] {
         assert!(outcome.stderr.contains(command), "{}", outcome.stderr);
     }
 }

@@ -16,7 +16,7 @@ use burn::tensor::Device;
 use demc_data::Frame;
 use demc_infer::{Bundle, Precision};
 use demc_model::{Reading, Variant, Weights};
-use live::{FEATURES, Python, random_bundle, uniform};
+use live::{FEATURES, Python, random_bundle, read_floats, uniform, write_floats};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use tempfile::TempDir;
@@ -83,12 +83,11 @@ fn onnx_runtime_computes_what_this_program_does() {
         .map(|size| frames(*size, &bundles[0].1, &mut rng))
         .collect();
     for (case, frames) in frames.iter().enumerate() {
-        write(&folder.join(format!("{case}.color")), frames, |frame| {
-            &frame.color
-        });
-        write(&folder.join(format!("{case}.features")), frames, |frame| {
-            &frame.features
-        });
+        let [color, features] = ["color", "features"].map(|name| format!("{case}.{name}"));
+        let colors = frames.iter().flat_map(|frame| &frame.color);
+        write_floats(&folder.join(color), colors);
+        let planes = frames.iter().flat_map(|frame| &frame.features);
+        write_floats(&folder.join(features), planes);
     }
     fs::write(folder.join("sizes.json"), format!("{SIZES:?}")).expect("written");
 
@@ -112,7 +111,7 @@ fn onnx_runtime_computes_what_this_program_does() {
                 .collect();
             let lit = expected.iter().filter(|&&v| v > 1e-3).count();
             assert!(lit > expected.len() / 2, "{what}: only {lit} are lit");
-            let found = read(&folder.join(format!("{name}.{case}.output")));
+            let found = read_floats(&folder.join(format!("{name}.{case}.output")));
             for (worst, tolerance) in worst.iter_mut().zip([OF_LARGEST, OF_VALUE]) {
                 let share = assert_close(&what, &found, &expected, tolerance);
                 *worst = worst.max(1e-4 * share);
@@ -170,16 +169,4 @@ fn frames([batch, height, width]: [usize; 3], bundle: &Bundle, rng: &mut ChaCha8
         }
     };
     (0..batch).map(|_| frame()).collect()
-}
-
-fn write(path: &Path, frames: &[Frame], values: impl Fn(&Frame) -> &Vec<f32>) {
-    let values = frames.iter().flat_map(|frame| values(frame).iter());
-    let bytes: Vec<u8> = values.flat_map(|value| value.to_le_bytes()).collect();
-    fs::write(path, bytes).expect("a writable temporary directory");
-}
-
-fn read(path: &Path) -> Vec<f32> {
-    let bytes = fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
-    let words = bytes.as_chunks().0.iter();
-    words.map(|word| f32::from_le_bytes(*word)).collect()
 }

@@ -103,7 +103,7 @@ pub enum BundleError {
     )]
     TooLargeForOnnx {
         /// What it would need.
-        bytes: usize,
+        bytes: u64,
     },
     /// What was read back after writing is not what was written.
     #[error("{}: read back after writing, but {what} differs: do not use this file", path.display())]

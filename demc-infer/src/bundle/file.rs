@@ -160,6 +160,8 @@ fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleE
     let meta: BundleMeta = serde_json::from_str(entry).map_err(json)?;
     let mut problems = meta.model.validate();
     problems.extend(statistics_problems(&meta));
+    let layout = meta.layout.validate().into_iter();
+    problems.extend(layout.map(|problem| format!("layout: {problem}")));
     match problems.is_empty() {
         true => Ok((meta, names)),
         false => Err(invalid(problems.join("; "))),

@@ -182,6 +182,21 @@ fn entries_that_lie_are_refused() {
             "number out of range",
         ),
         (
+            r#"\"gamma\":2.2"#,
+            r#"\"gamma\":-0.0"#,
+            "normalizer.gamma: -0 is not above 0",
+        ),
+        (
+            r#"\"normal\":[\"normal.X\""#,
+            r#"\"normal\":[\"\\u001b[2J\""#,
+            r#"layout: channel "\u{1b}[2J" is no name"#,
+        ),
+        (
+            r#"\"normal\":[\"normal.X\""#,
+            r#"\"normal\":[\"R\""#,
+            r#"layout: channel "R" is named twice"#,
+        ),
+        (
             r#"\"step\":12"#,
             r#"\"step\":12e400"#,
             "number out of range",

@@ -11,29 +11,29 @@ use super::file::{damaged, parse_meta, read};
 use super::tensors::{one_line, values};
 use super::{BundleError, BundleFile, BundleMeta, Names, Precision};
 
-/// What can be wrong with a tensor, in the order of the message: how the list begins.
-const PROBLEMS: [&str; 5] = [
-    "missing",
-    "not of this network",
-    "of another shape",
-    "of no use",
-    "negative variance in",
-];
-
-/// The problems found, a list a kind.
+/// The tensors that are wrong, a list a kind.
 #[derive(Default)]
-struct Problems([Vec<String>; PROBLEMS.len()]);
+struct Problems {
+    missing: Vec<String>,
+    unknown: Vec<String>,
+    misshaped: Vec<String>,
+    useless: Vec<String>,
+    negative: Vec<String>,
+}
 
 impl Problems {
-    fn add(&mut self, kind: usize, tensor: impl Into<String>) {
-        self.0[kind].push(tensor.into());
-    }
-
     /// All of them in a line; `None` where there are none.
     fn line(self) -> Option<String> {
-        let lists = PROBLEMS.iter().zip(self.0);
-        let lists = lists.filter(|(_, tensors)| !tensors.is_empty());
+        let lists = [
+            ("missing", self.missing),
+            ("not of this network", self.unknown),
+            ("of another shape", self.misshaped),
+            ("of no use", self.useless),
+            ("negative variance in", self.negative),
+        ];
         let parts: Vec<String> = lists
+            .into_iter()
+            .filter(|(_, tensors)| !tensors.is_empty())
             .map(|(what, tensors)| format!("{what}: {}", tensors.join(", ")))
             .collect();
         (!parts.is_empty()).then(|| parts.join("; "))
@@ -65,26 +65,28 @@ impl BundleFile {
         for (name, shape) in meta.model.weight_shapes() {
             let called = Names::Torch.from_burn(&name);
             let Some(view) = found.remove(&name) else {
-                problems.add(0, called);
+                problems.missing.push(called);
                 continue;
             };
             if view.shape() != shape {
-                problems.add(2, format!("{called} {:?} for {shape:?}", view.shape()));
+                problems
+                    .misshaped
+                    .push(format!("{called} {:?} for {shape:?}", view.shape()));
                 continue;
             }
             if view.dtype() == Dtype::F16 {
                 precision = Precision::F16;
             }
             match values(&view) {
-                Err(detail) => problems.add(3, format!("{called} ({detail})")),
+                Err(detail) => problems.useless.push(format!("{called} ({detail})")),
                 Ok(data) if name.ends_with(".running_var") && data.iter().any(|x| *x < 0.0) => {
-                    problems.add(4, called);
+                    problems.negative.push(called);
                 }
                 Ok(data) => weights.push(Weight { name, shape, data }),
             }
         }
         for name in found.into_keys() {
-            problems.add(1, Names::Torch.from_burn(&name));
+            problems.unknown.push(Names::Torch.from_burn(&name));
         }
         match problems.line() {
             Some(problems) => Err(BundleError::Import {

@@ -143,13 +143,18 @@ impl Bundle {
         }
     }
 
-    /// The bundle that a file of this precision holds: with its weights rounded, on `flex`.
+    /// The bundle that a file of this precision holds: in f16 with its weights rounded.
     ///
     /// # Errors
     /// A weight that f16 cannot hold.
     pub fn rounded(&self, precision: Precision) -> Result<Self, BundleError> {
-        let bytes = self.to_bytes(Names::Burn, precision)?;
-        BundleFile::parse("memory".into(), &bytes)?.into_bundle(&Device::flex())
+        match precision {
+            Precision::F32 => Ok(self.clone()),
+            Precision::F16 => {
+                let bytes = self.to_bytes(Names::Burn, precision)?;
+                BundleFile::parse("memory".into(), &bytes)?.into_bundle(&self.device())
+            }
+        }
     }
 
     /// Loads a run directory (its best weights, else those of the latest checkpoint), a checkpoint directory or a

@@ -38,7 +38,7 @@ pub struct Export {
     /// The file to write; an existing one is replaced, but never the model itself
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Run the file on synthetic images, in ONNX Runtime or in PyTorch, and compare: 1e-4 is too much
+    /// Run the file on synthetic images, in ONNX Runtime or in PyTorch, and compare; fail above 1e-4
     #[arg(long)]
     verify: bool,
     /// The Python for --verify [default: the variable DEMC_PYTHON, else python3]

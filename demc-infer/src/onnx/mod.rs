@@ -11,8 +11,8 @@
 //! All variants have both inputs; color-only does not look at the second. In and out is float32, and so is every
 //! computation; [`Precision::F16`] is how the convolutions' weights are stored.
 //!
-//! The opset is 17: of the operators here none has changed between it and 21, and a newer one would only shut older
-//! runtimes out (ONNX Runtime before 1.15, TensorRT 8.6, OpenVINO 2022).
+//! The opset is 17, of June 2022: later ones add types to the operators used here and change nothing that they compute, so a
+//! newer one would only shut older runtimes out.
 
 mod graph;
 mod network;
@@ -23,6 +23,7 @@ use std::io::Write;
 use std::path::Path;
 
 use demc_data::frame::FEATURE_NAMES;
+use demc_model::ModelConfig;
 use demc_model::config::{COLOR_CHANNELS, FEATURE_CHANNELS};
 
 use crate::{Bundle, BundleError, Precision};
@@ -37,7 +38,9 @@ pub const OPSET: i64 = 17;
 /// The version of the file format that came with it (ONNX 1.12).
 const IR_VERSION: i64 = 8;
 /// Protobuf's limit for a message: what lies above it only files beside the graph could hold.
-const MOST_BYTES: usize = i32::MAX as usize;
+const MOST_BYTES: u64 = i32::MAX as u64;
+/// More than a file takes beside its weights: names, settings, texts. Measured: 21 kB.
+const OTHER_BYTES: u64 = 1 << 20;
 
 /// Name of the input with the noisy colour.
 pub const COLOR: &str = "color";
@@ -66,8 +69,9 @@ impl Bundle {
     /// A weight that f16 cannot hold, a network too large for one file, a path that cannot be written;
     /// [`BundleError::ReadBack`] where another file is read than was written.
     pub fn export_onnx(&self, path: &Path, precision: Precision) -> Result<(), BundleError> {
+        check_size(&self.meta.model, precision)?;
         let model = self.onnx(precision)?;
-        let bytes = encode(&model)?;
+        let bytes = model.encode_to_vec();
         demc_data::file::write_whole(path, |file| file.write_all(&bytes))?;
         drop(bytes);
         let back = fs::read(path).map_err(|source| BundleError::Read {
@@ -123,10 +127,15 @@ impl Bundle {
     }
 }
 
-fn encode(model: &Model) -> Result<Vec<u8>, BundleError> {
-    match model.encoded_len() {
+/// Refuses a network that one file cannot hold.
+fn check_size(config: &ModelConfig, precision: Precision) -> Result<(), BundleError> {
+    let each = match precision {
+        Precision::F32 => 4,
+        Precision::F16 => 2,
+    };
+    match config.parameter_count() * each + OTHER_BYTES {
         bytes if bytes > MOST_BYTES => Err(BundleError::TooLargeForOnnx { bytes }),
-        _ => Ok(model.encode_to_vec()),
+        _ => Ok(()),
     }
 }
 

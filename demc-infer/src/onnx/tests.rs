@@ -98,3 +98,14 @@ fn a_weight_beyond_f16_is_named_and_nothing_is_written() {
     bundle.export_onnx(&path, Precision::F32).expect("f32");
     assert!(path.exists());
 }
+
+#[test]
+fn a_network_beyond_two_gibibytes_is_refused_before_it_is_built() {
+    let mut config = bundle(Variant::Demc).meta.model;
+    config.width = 64;
+    assert!(check_size(&config, Precision::F32).is_ok());
+    config.width = 256;
+    let error = check_size(&config, Precision::F32).expect_err("2.7 GB");
+    assert!(error.to_string().contains("export with f16"), "{error}");
+    assert!(check_size(&config, Precision::F16).is_ok());
+}
