@@ -1,6 +1,7 @@
 //! A bundle file taken apart: header and tensors, before they are a network.
 
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use demc_data::frame::FEATURE_NAMES;
@@ -36,7 +37,7 @@ impl BundleFile {
     /// than f32 and f16 or with NaN or infinity in it; statistics that nothing can be divided by.
     pub fn read(path: &Path) -> Result<Self, BundleError> {
         let path = locate::locate(path)?;
-        let bytes = fs::read(&path).map_err(|source| BundleError::Read {
+        let bytes = read_regular(&path).map_err(|source| BundleError::Read {
             path: path.clone(),
             source,
         })?;
@@ -83,6 +84,17 @@ impl BundleFile {
             precision,
             weights,
         })
+    }
+}
+
+/// A device need not end, and a FIFO would wait for a writer.
+fn read_regular(path: &Path) -> io::Result<Vec<u8>> {
+    match fs::metadata(path)?.is_file() {
+        true => fs::read(path),
+        false => Err(io::Error::new(
+            io::ErrorKind::InvalidInput,
+            "not a regular file",
+        )),
     }
 }
 
