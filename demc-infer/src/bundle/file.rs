@@ -51,7 +51,7 @@ impl BundleFile {
     pub fn parse(path: PathBuf, bytes: &[u8]) -> Result<Self, BundleError> {
         let damaged = |error: safetensors::SafeTensorError| BundleError::Damaged {
             path: path.clone(),
-            detail: error.to_string(),
+            detail: printable(&error.to_string()),
         };
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
         let entry = header.metadata().as_ref().and_then(|all| all.get(KEY));
@@ -62,16 +62,17 @@ impl BundleFile {
         let mut precision = Precision::F32;
         let mut weights = Vec::with_capacity(tensors.len());
         for (name, view) in tensors.iter() {
+            let name = printable(name);
             if view.dtype() == Dtype::F16 {
                 precision = Precision::F16;
             }
             let data = values(&view).map_err(|detail| BundleError::Tensor {
                 path: path.clone(),
-                name: name.into(),
+                name: name.clone(),
                 detail,
             })?;
             weights.push(Weight {
-                name: names.to_burn(name),
+                name: names.to_burn(&name),
                 shape: view.shape().to_vec(),
                 data,
             });
@@ -98,6 +99,11 @@ fn read_regular(path: &Path) -> io::Result<Vec<u8>> {
     }
 }
 
+/// Text of a file, as it is shown in a message of one line: names may hold line breaks, and codes that a terminal obeys.
+fn printable(text: &str) -> String {
+    text.replace(char::is_control, "\u{fffd}")
+}
+
 /// The metadata in the header entry. The format is looked at first: another format may have other keys.
 fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleError> {
     #[derive(Deserialize)]
@@ -112,7 +118,7 @@ fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleE
         path: path.into(),
         detail,
     };
-    let json = |error: serde_json::Error| invalid(error.to_string());
+    let json = |error: serde_json::Error| invalid(printable(&error.to_string()));
     let Version { format } = serde_json::from_str(entry).map_err(json)?;
     if format != u64::from(FORMAT) {
         return Err(BundleError::Format {

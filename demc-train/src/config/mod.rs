@@ -93,7 +93,10 @@ impl Config {
     /// # Errors
     /// As [`load`](Self::load).
     pub fn parse(path: &Path, text: &str, sets: &[String]) -> Result<Self, ConfigError> {
-        let config = source::parse(path, text, sets).map_err(ConfigError::Source)?;
+        let config = source::parse(path, text, sets);
+        // A key may hold line breaks, and codes that a terminal obeys.
+        let printable = |error: String| error.replace(char::is_control, "\u{fffd}");
+        let config = config.map_err(|error| ConfigError::Source(printable(error)))?;
         let problems = config.validate();
         match problems.is_empty() {
             true => Ok(config),
@@ -303,6 +306,17 @@ mod tests {
             );
         }
         assert_eq!(problems.len(), 4);
+    }
+
+    #[test]
+    fn a_key_with_line_breaks_does_not_break_the_message() {
+        let text = "[train]\n\"a\\nb\\u001b[2J\" = 1";
+        let error = Config::parse(Path::new("x.toml"), text, &[]).unwrap_err();
+        let error = error.to_string();
+        assert!(
+            error.starts_with("x.toml:2: unknown key `train.a\u{fffd}b\u{fffd}[2J`"),
+            "{error}"
+        );
     }
 
     #[test]
