@@ -144,6 +144,36 @@ fn parts_windows_and_attributes_are_the_inputs() {
     }
 }
 
+#[test]
+fn equal_images_give_equal_bytes() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let (input, output) = (dir.path().join("in.exr"), dir.path().join("out.exr"));
+    for parts in [1, 2] {
+        let named = |part| header(Some(["a", "b"][part]), SIZE, scene_kinds(), Method::ZIP16);
+        write_file(
+            &input,
+            (0..parts)
+                .map(|part| with_attributes(named(part)))
+                .collect(),
+        );
+        let mut layout = layout();
+        if parts == 2 {
+            layout
+                .color
+                .iter_mut()
+                .for_each(|name| *name = format!("b.{name}"));
+        }
+        let bytes = || {
+            let options = WriteOptions::default();
+            write_denoised(&input, &layout, &color(PIXELS), &output, &options).expect("sound");
+            assert_eq!(headers(&input), headers(&output));
+            std::fs::read(&output).expect("just written")
+        };
+        let first = bytes();
+        assert!((0..16).all(|_| bytes() == first));
+    }
+}
+
 /// The blocks of a part as they are stored.
 fn blocks(path: &Path, part: usize) -> Vec<String> {
     let file = BufReader::new(File::open(path).expect("readable"));

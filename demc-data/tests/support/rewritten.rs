@@ -96,6 +96,11 @@ pub fn with_attributes(mut header: Header) -> Header {
         bytes: vec![1, 0, 255, 3].into(),
     };
     own.other.insert("renderer/passes".into(), bytes);
+    for index in 0..8 {
+        let number = AttributeValue::I32(index);
+        own.other
+            .insert(format!("x{index}").as_str().into(), number);
+    }
     let shared = &mut header.shared_attributes;
     shared.pixel_aspect = 1.5;
     shared.chromaticities = Some(Chromaticities {
