@@ -7,7 +7,8 @@ use serde::Serialize;
 /// One channel of a file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Channel {
-    /// Its name, as a layout has to spell it: `Layer.channel` in a file of several parts.
+    /// Its name, as a layout has to spell it: `Layer.channel` in a file of several parts. What is no UTF-8, and control
+    /// characters, are U+FFFD.
     pub name: String,
     /// The type of its samples.
     pub kind: Kind,

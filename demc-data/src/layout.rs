@@ -194,6 +194,8 @@ fn mistake(name: &str, detail: String) -> Error {
 /// A TOML error as `line N: what`.
 fn one_line(error: &toml::de::Error, text: &str) -> String {
     let message = error.message().trim_end().replace('\n', ", ");
+    // A key may hold codes that a terminal obeys.
+    let message = message.replace(char::is_control, "\u{fffd}");
     match error.span() {
         Some(span) => {
             let line = text[..span.start.min(text.len())].lines().count().max(1);

@@ -14,6 +14,7 @@
 //! that the table of blocks fits into the file. So is a block: it has to be as long as the file is, and its pixels are
 //! not more than its bytes can stand for. Planes grow with the rows that were decoded.
 
+mod attributes;
 mod blocks;
 mod compression;
 mod plan;

@@ -7,6 +7,7 @@ use ::exr::meta::header::Header;
 use ::exr::meta::{BlockDescription, Headers};
 
 use super::compression::name_of;
+use super::read::printable;
 use super::rewrite::{Change, Keep, WriteOptions};
 use super::{Compression, ExrFile, Precision, undecodable};
 use crate::channel::Channel;
@@ -126,9 +127,7 @@ fn colored_header(
     changes: &mut Vec<Change>,
 ) -> Header {
     let name = input.own_attributes.layer_name.as_ref();
-    let part = name.map_or(String::new(), |name| {
-        String::from_utf8_lossy(name.bytes()).into_owned()
-    });
+    let part = name.map_or(String::new(), printable);
     let channels = origins.iter().map(|origin| {
         let mut channel = input.channels.list[origin.index].clone();
         if origin.plane.is_some() {

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use ::exr::block::lines::LineRef;
 use ::exr::error::Error as ExrError;
-use ::exr::meta::attribute::SampleType;
+use ::exr::meta::attribute::{SampleType, Text};
 use ::exr::meta::header::Header;
 use half::f16;
 
@@ -123,13 +123,12 @@ impl<R: Read + Seek> ExrFile<R> {
 }
 
 fn channels_of(part: usize, header: &Header, several: bool) -> Vec<Channel> {
-    let layer = header.own_attributes.layer_name.as_ref();
-    let layer = layer.map(|name| String::from_utf8_lossy(name.bytes()).into_owned());
+    let layer = header.own_attributes.layer_name.as_ref().map(printable);
     let channels = header.channels.list.iter().enumerate();
     let channels = channels.map(|(index, channel)| Channel {
         name: full_name(
             layer.as_deref().filter(|_| several),
-            &String::from_utf8_lossy(channel.name.bytes()),
+            &printable(&channel.name),
         ),
         kind: match channel.sample_type {
             SampleType::F16 => Kind::Half,
@@ -142,6 +141,12 @@ fn channels_of(part: usize, header: &Header, several: bool) -> Vec<Channel> {
         index,
     });
     channels.collect()
+}
+
+/// A name of the file, as it is shown: in a message of one line, on a terminal.
+pub(super) fn printable(name: &Text) -> String {
+    let name = String::from_utf8_lossy(name.bytes());
+    name.replace(char::is_control, "\u{fffd}")
 }
 
 /// Decodes every full-size block of the parts that hold a wanted channel, on this thread.

@@ -16,7 +16,7 @@ use half::f16;
 use super::blocks::{Grid, Source};
 use super::plan::{Origin, Plan};
 use super::write::{io_error, saturated_half};
-use super::{ExrFile, guarded};
+use super::{ExrFile, attributes, guarded};
 use crate::{Error, file};
 
 /// Blocks that are compressed at once, in bytes, but for one that is larger by itself (ours: enough work for many
@@ -45,13 +45,14 @@ pub(super) fn recode<R: Read + Seek>(
         clamped: 0,
     };
     let written = file::write_whole(output, |writer| {
-        ::exr::block::write(writer, plan.headers.clone(), false, |_, blocks| {
+        ::exr::block::write(&mut *writer, plan.headers.clone(), false, |_, blocks| {
             let mut parts = plan.parts.iter().enumerate();
             parts.try_for_each(|(part, from)| match &from.channels {
                 None => recoder.copy(part, from.input, blocks),
                 Some(origins) => recoder.code(part, from.input, origins, blocks),
             })
         })
+        .and_then(|()| attributes::sort(writer, &plan.headers))
         .map_err(io_error)
     });
     match recoder.input.error {

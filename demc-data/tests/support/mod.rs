@@ -2,6 +2,7 @@
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
 pub mod files;
+pub mod rewritten;
 
 use std::path::{Path, PathBuf};
 

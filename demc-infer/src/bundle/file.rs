@@ -1,6 +1,6 @@
 //! A bundle file taken apart: header and tensors, before they are a network.
 
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
@@ -91,6 +91,11 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>, BundleError> {
         path: path.into(),
         source,
     };
+    // A FIFO would wait for a writer.
+    if !fs::metadata(path).map_err(failed)?.is_file() {
+        let source = io::Error::new(io::ErrorKind::InvalidInput, "not a regular file");
+        return Err(failed(source));
+    }
     let mut file = File::open(path).map_err(failed)?;
     let mut bytes = Vec::new();
     let mut more = |bytes: &mut Vec<u8>, count: u64| -> io::Result<()> {

@@ -7,6 +7,8 @@
 mod source;
 mod tables;
 
+use std::fs::File;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use demc_data::DataConfig;
@@ -20,6 +22,8 @@ pub use tables::{OnNan, RunConfig, TrainConfig};
 
 /// More steps than this are a slip of the keyboard: the paper's run is 250,000.
 const MOST_STEPS: u64 = 1_000_000_000;
+/// A longer file is no configuration: ours have 4 KB.
+const MOST_BYTES: u64 = 1 << 20;
 /// More batches in a step are one too.
 const MOST_BATCHES: u64 = 65_536;
 
@@ -69,18 +73,11 @@ impl Config {
     /// # Errors
     /// See [`ConfigError`]; every unknown key and every value out of range is named.
     pub fn load(path: &Path, sets: &[String]) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read {
+        let text = read_text(path).map_err(|source| ConfigError::Read {
             path: path.into(),
             source,
         })?;
-        let mut config = source::parse(path, &text, sets).map_err(ConfigError::Source)?;
-        let problems = config.validate();
-        if !problems.is_empty() {
-            return Err(ConfigError::Values {
-                path: path.into(),
-                problems,
-            });
-        }
+        let mut config = Self::parse(path, &text, sets)?;
         if config.run.dir.as_os_str().is_empty() {
             config.run.dir = Path::new("runs").join(path.file_stem().unwrap_or_default());
         }
@@ -89,6 +86,25 @@ impl Config {
             source,
         })?;
         Ok(config)
+    }
+
+    /// Edits and checks the text of a configuration, whose paths stay as they are; `path` is what errors call it.
+    ///
+    /// # Errors
+    /// As [`load`](Self::load).
+    pub fn parse(path: &Path, text: &str, sets: &[String]) -> Result<Self, ConfigError> {
+        let config = source::parse(path, text, sets);
+        // A key may hold line breaks, and codes that a terminal obeys.
+        let printable = |error: String| error.replace(char::is_control, "\u{fffd}");
+        let config = config.map_err(|error| ConfigError::Source(printable(error)))?;
+        let problems = config.validate();
+        match problems.is_empty() {
+            true => Ok(config),
+            false => Err(ConfigError::Values {
+                path: path.into(),
+                problems,
+            }),
+        }
     }
 
     fn make_absolute(&mut self) -> std::io::Result<()> {
@@ -243,6 +259,19 @@ impl Config {
     }
 }
 
+/// The text of a file that may be a pipe, but not one without end.
+fn read_text(path: &Path) -> io::Result<String> {
+    let mut text = String::new();
+    File::open(path)?
+        .take(MOST_BYTES + 1)
+        .read_to_string(&mut text)?;
+    if text.len() as u64 > MOST_BYTES {
+        let why = format!("more than {MOST_BYTES} bytes; expected a configuration in TOML");
+        return Err(io::Error::new(io::ErrorKind::InvalidData, why));
+    }
+    Ok(text)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -277,6 +306,30 @@ mod tests {
             );
         }
         assert_eq!(problems.len(), 4);
+    }
+
+    #[test]
+    fn a_key_with_line_breaks_does_not_break_the_message() {
+        let text = "[train]\n\"a\\nb\\u001b[2J\" = 1";
+        let error = Config::parse(Path::new("x.toml"), text, &[]).unwrap_err();
+        let error = error.to_string();
+        assert!(
+            error.starts_with("x.toml:2: unknown key `train.a\u{fffd}b\u{fffd}[2J`"),
+            "{error}"
+        );
+    }
+
+    #[test]
+    fn a_file_without_end_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("long.toml");
+        std::fs::write(&path, "#".repeat(1 << 20)).unwrap();
+        assert!(Config::load(&path, &[]).is_ok());
+        std::fs::write(&path, "#".repeat((1 << 20) + 1)).unwrap();
+        let error = Config::load(&path, &[]).unwrap_err();
+        assert_eq!(error.to_string(), path.display().to_string());
+        let source = std::error::Error::source(&error).unwrap().to_string();
+        assert!(source.starts_with("more than 1048576 bytes"), "{source}");
     }
 
     /// The file that the documentation calls the reference.
