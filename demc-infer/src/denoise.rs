@@ -6,6 +6,7 @@ use demc_data::frame::FEATURE_NAMES;
 use demc_data::{FEATURES, Frame};
 use demc_model::Ops;
 use demc_model::config::COLOR_CHANNELS;
+use demc_model::metrics::ImageError;
 
 use crate::Bundle;
 use crate::memory::{self, TooLarge};
@@ -81,6 +82,16 @@ pub enum DenoiseError {
         name: String,
         /// What the device said.
         source: TensorReadError,
+    },
+    /// An image with values that are not finite has no score.
+    #[error("{name}: {what}")]
+    Image {
+        /// The frame.
+        name: String,
+        /// Which image of it.
+        what: String,
+        /// How many.
+        source: ImageError,
     },
     /// There is nothing to compare with.
     #[error("{name}: no reference in the file")]

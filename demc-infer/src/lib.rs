@@ -6,6 +6,7 @@
 //! result against a reference, [`picture`] makes it visible. Training validates with exactly this code.
 #![forbid(unsafe_code)]
 
+pub mod baseline;
 pub mod bundle;
 pub mod compute;
 pub mod denoise;
@@ -14,7 +15,10 @@ pub mod evaluate;
 pub mod memory;
 pub mod padding;
 pub mod picture;
+pub mod report;
+pub mod statistics;
 
+pub use baseline::{Baseline, BaselineError};
 pub use bundle::{Bundle, BundleError, BundleFile, BundleMeta, Names, Precision};
 pub use denoise::DenoiseError;
 pub use device::DeviceError;

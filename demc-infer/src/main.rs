@@ -1,4 +1,4 @@
-//! `demc-infer`: denoise, evaluate, export, inspect. See `cli`.
+//! `demc-infer`: denoise, evaluate, export, inspect, report. See `cli`.
 #![forbid(unsafe_code)]
 
 mod cli;

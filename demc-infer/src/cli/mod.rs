@@ -7,6 +7,8 @@ mod denoise;
 mod evaluate;
 mod export;
 mod inspect;
+mod report;
+mod scenes;
 
 use std::path::{Path, PathBuf};
 
@@ -32,6 +34,7 @@ enum Command {
     Evaluate(evaluate::Evaluate),
     Export(export::Export),
     Inspect(inspect::Inspect),
+    Report(report::Report),
 }
 
 /// Something asked for on the command line that cannot be: exit code 2.
@@ -46,6 +49,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         Command::Evaluate(command) => command.run(),
         Command::Export(command) => command.run(),
         Command::Inspect(command) => command.run(),
+        Command::Report(command) => command.run(),
     }
 }
 
