@@ -122,7 +122,7 @@ def main(report: Path, screenshots: Path | None) -> None:
             for scheme in ["light", "dark"]:
                 page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
                 troubles, requests = [], []
-                page.on("console", lambda message: troubles.append(message.text))
+                page.on("console", lambda message: message.type == "error" and troubles.append(message.text))
                 page.on("pageerror", lambda error: troubles.append(str(error)))
                 page.on("request", lambda request: requests.append(request.url))
                 settle(page, lambda: page.goto(report.as_uri()))

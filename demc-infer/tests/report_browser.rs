@@ -24,15 +24,28 @@ fn a_report_works_in_a_browser() {
     };
     let run = run_directory();
     let others = run.path().join("others");
-    let images = ["col-classroom-1", "col-dining-room-1", "gen-room-test-1", "gen-table-test-1"];
+    let images = [
+        "col-classroom-1",
+        "col-dining-room-1",
+        "gen-room-test-1",
+        "gen-table-test-1",
+    ];
     let images = images.map(|name| sample_image(&format!("{name}.exr")).into_os_string());
-    let mut list = arguments!["denoise", "-o", others];
+    let mut list = arguments!["denoise", "-o", others].to_vec();
     list.extend(images);
     demc_infer(list).success();
     let file = run.path().join("report.html");
     let baseline = format!("</script><b>\"other\"={}", others.display());
     demc_infer(arguments![
-        "report", "--model", run.path(), "--data", sample(), "--baseline", baseline, "-o", file
+        "report",
+        "--model",
+        run.path(),
+        "--data",
+        sample(),
+        "--baseline",
+        baseline,
+        "-o",
+        file
     ])
     .success();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/report_browser.py");

@@ -6,12 +6,13 @@ use std::path::Path;
 use demc_data::{ChannelLayout, read_frame};
 use demc_model::metrics::{Image, METRICS};
 
-/// Difference allowed, by the expected value. Formulas in float64 agree to rounding; the gamma here is the float32 2.2
-/// (relative error 2e-8), and FLIP is single precision on both sides, with sums in another order.
+/// Difference allowed, by the expected value. Formulas in float64 agree to rounding, but the headline's epsilon is the loss's
+/// float32 0.001 (relative error 5e-8) and the gamma the float32 2.2 (2e-8); FLIP is single precision on both sides, with
+/// sums in another order.
 fn tolerance(metric: &str) -> f64 {
     match metric {
         "flip" => 1e-4,
-        "ssim" | "psnr" => 1e-6,
+        "relmse" | "relmse-trimmed" | "ssim" | "psnr" => 1e-7,
         _ => 1e-9,
     }
 }

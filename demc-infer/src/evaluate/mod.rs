@@ -12,6 +12,7 @@ use std::collections::BTreeMap;
 
 use demc_data::Frame;
 use demc_model::metrics::{self, Image, METRICS};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::Bundle;
@@ -42,12 +43,19 @@ impl Score {
 
     /// All metrics of `candidate` against `reference`.
     pub fn full(candidate: &Image, reference: &Image) -> Self {
-        let headline = Self::headline(candidate, reference);
-        let others = METRICS.iter().filter(|metric| !is_headline(metric.name));
-        let others = others.map(|m| (m.name.to_owned(), (m.of)(candidate, reference)));
+        candidate.prepare();
+        reference.prepare();
+        let values = METRICS.par_iter().map(|m| (m.of)(candidate, reference));
+        let values: Vec<Option<f64>> = values.collect();
+        let mut others: BTreeMap<String, Option<f64>> = METRICS
+            .iter()
+            .zip(values)
+            .map(|(metric, value)| (metric.name.to_owned(), value))
+            .collect();
         Self {
-            others: others.collect(),
-            ..headline
+            relmse: others.remove("relmse").flatten().expect("always a value"),
+            ssim: others.remove("ssim").flatten(),
+            others,
         }
     }
 

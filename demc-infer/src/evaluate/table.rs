@@ -170,7 +170,7 @@ mod tests {
                 "",
             ]
         );
-        assert!(table.contains("| a\\|b |"), "{table}");
+        assert!(table.contains("| a\\|b  |"), "{table}");
         assert!(table.contains("\nsmape: mean over values"), "{table}");
     }
 }

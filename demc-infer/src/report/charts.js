@@ -3,8 +3,15 @@
   const against = [...new Set(data.differences.map((difference) => difference.against))];
   const words = (difference) => {
     const better = cost(metricsByName.get(difference.metric), 1) > 0 ? difference.mean < 0 : difference.mean > 0;
-    return difference.significant ? (better ? "better" : "worse") : "no significant difference";
+    return difference.significant ? (better ? "better" : "worse") : "not significant";
   };
+  function sentence(name, rows) {
+    const parts = [["better", "Better than"], ["worse", "Worse than"], ["not significant", "No significant difference from"]].flatMap(([word, phrase]) => {
+      const of = rows.filter((row) => words(row) === word).map((row) => row.metric);
+      return of.length ? `${phrase} ${name} in ${of.join(", ")}.` : [];
+    });
+    return parts.join(" ");
+  }
   // Mean and interval on a scale of its own, zero in the middle, better to the left.
   function plot(difference) {
     const sign = cost(metricsByName.get(difference.metric), 1) > 0 ? 1 : -1;
@@ -22,18 +29,19 @@
     const head = ["metric", "difference", "95 % interval", "better ← → worse", "in words"].map((text, i) => make("th", { scope: "col", text, ...(i > 2 ? { style: i === 3 ? "text-align:center" : "text-align:left" } : {}) }));
     byId("difference-tables").append(make("div", {}, make("h3", { text: `denoised against ${name}, ${rows[0].images} images` }),
       make("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `differences from ${name}` }, make("table", {}, make("thead", {}, make("tr", {}, ...head)),
-        make("tbody", {}, ...rows.map((difference) => make("tr", {},
+        make("tbody", {}, ...rows.map((difference) => make("tr", { title: difference.verdict },
           make("th", { scope: "row", text: difference.metric === "energy-bias" ? "|energy-bias|" : difference.metric }),
           make("td", { text: number(difference.mean, true) }),
           make("td", { text: difference.interval.map((end) => number(end, true)).join(" to ") }),
           make("td", { class: "plot" }, plot(difference)),
-          make("td", { class: { better: "better-word", worse: "worse-word" }[words(difference)] ?? "none", text: words(difference) }))))))));
+          make("td", { class: { better: "better-word", worse: "worse-word" }[words(difference)] ?? "none", text: words(difference) })))))),
+      make("p", { class: "note", text: sentence(name, rows) })));
   }
   if (!against.length) byId("differences").hidden = true;
-  if (data.images.length < data.fewImages) byId("few").textContent = `Intervals from ${data.images.length} images are too narrow: take them as a lower bound.`;
+  if (data.images.length < data.fewImages) byId("few").textContent = `Intervals from ${data.images.length} images are too narrow: what seems significant may not be.`;
 
   // Histograms: a row a method, on one axis.
-  const BINS = 24, WIDTH = 240, ROW = 26;
+  const BINS = 22, WIDTH = 260, ROW = 24, LEFT = 58;
   function histogram(metric) {
     const methods = data.methods.filter((name) => name !== "black");
     const values = new Map(methods.map((name) => [name, data.images.map((image) => image.scores[name][metric.name]).filter(isValue)]));
@@ -43,7 +51,7 @@
     const to = log ? Math.log10 : (value) => value;
     let [low, high] = [Math.min(...all), Math.max(...all)].map(to);
     if (high - low < 1e-9) { low -= 0.5; high += 0.5; }
-    const x = (value) => 1 + (WIDTH - 2) * (to(value) - low) / (high - low);
+    const x = (value) => LEFT + 1 + (WIDTH - LEFT - 2) * (to(value) - low) / (high - low);
     const counts = new Map([...values].map(([name, list]) => {
       const bins = new Array(BINS).fill(0);
       for (const value of list) bins[Math.min(BINS - 1, Math.floor(BINS * (to(value) - low) / (high - low)))]++;
@@ -54,22 +62,22 @@
     const picture = svg("svg", { viewBox: `0 0 ${WIDTH} ${height}`, role: "img", "aria-label": `${metric.name}: ${methods.map((name) => `${name} mean ${number(data.mean[name][metric.name])}`).join(", ")}` });
     methods.forEach((name, row) => {
       const base = (row + 1) * ROW;
-      picture.append(svg("line", { x1: 0, x2: WIDTH, y1: base, y2: base, stroke: "var(--line)" }));
+      picture.append(svg("line", { x1: LEFT, x2: WIDTH, y1: base, y2: base, stroke: "var(--line)" }));
       counts.get(name).forEach((count, bin) => {
         if (!count) return;
-        const tall = count / most * (ROW - 11);
-        const bar = svg("rect", { x: (bin * WIDTH / BINS + 0.5).toFixed(2), y: (base - tall).toFixed(2), width: (WIDTH / BINS - 1).toFixed(2), height: tall.toFixed(2), fill: color(name) });
+        const tall = count / most * (ROW - 9);
+        const bar = svg("rect", { x: (LEFT + bin * (WIDTH - LEFT) / BINS + 0.5).toFixed(2), y: (base - tall).toFixed(2), width: ((WIDTH - LEFT) / BINS - 1).toFixed(2), height: tall.toFixed(2), fill: color(name) });
         bar.append(svg("title"));
         bar.firstChild.textContent = `${name}: ${count} of ${values.get(name).length} images`;
         picture.append(bar);
       });
       const mean = data.mean[name][metric.name];
-      if (isValue(mean) && (!log || mean > 0)) picture.append(svg("line", { x1: x(mean), x2: x(mean), y1: base - ROW + 9, y2: base + 2, stroke: "var(--ink)", "stroke-width": 1.2 }));
-      const text = svg("text", { x: x(mean ?? 0) > WIDTH / 2 ? 0 : WIDTH, y: base - 5, "text-anchor": x(mean ?? 0) > WIDTH / 2 ? "start" : "end" });
-      text.textContent = name;
+      if (isValue(mean) && (!log || mean > 0)) picture.append(svg("line", { x1: x(mean), x2: x(mean), y1: base - ROW + 7, y2: base + 2, stroke: "var(--ink)", "stroke-width": 1.2 }));
+      const text = svg("text", { x: 0, y: base - 4 });
+      text.textContent = name.length > 11 ? `${name.slice(0, 10)}…` : name;
       picture.append(text);
     });
-    for (const [place, anchor, value] of [[0, "start", low], [WIDTH, "end", high]]) {
+    for (const [place, anchor, value] of [[LEFT, "start", low], [WIDTH, "end", high]]) {
       const text = svg("text", { x: place, y: height - 3, "text-anchor": anchor });
       text.textContent = number(log ? 10 ** value : value);
       picture.append(text);

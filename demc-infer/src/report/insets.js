@@ -5,12 +5,16 @@
     canvases = [];
     const rows = viewer.patches().map((patch) => {
       const title = make("h3", { text: patch.kind === "worst" ? "Worst patch " : "Median patch " },
-        make("span", { text: `${patch.width} × ${patch.height} pixels at ${patch.x}, ${patch.y}, by the error of the denoised image: relmse ${number(patch.relmse)}` }));
+        make("span", { text: `${patch.width} × ${patch.height} pixels at ${patch.x}, ${patch.y}; relmse of denoised ${number(patch.relmse)}` }));
+      // Errors stand under their pictures.
       const row = make("div", { class: "row" });
-      for (const layer of viewer.layers) {
+      const pictures = viewer.layers.filter((layer) => !layer.startsWith("error:"));
+      row.style.setProperty("--count", pictures.length);
+      for (const layer of [...pictures, ...pictures.map((name) => `error:${name}`).filter((layer) => viewer.layers.includes(layer))]) {
         const canvas = make("canvas", { role: "img", "aria-label": `${patch.kind} patch, ${viewer.label(layer)}`, width: patch.width, height: patch.height });
         canvases.push([canvas, layer, patch]);
-        row.append(make("figure", {}, canvas, make("figcaption", { text: viewer.label(layer), title: viewer.label(layer) })));
+        const caption = layer.startsWith("error:") ? "error" : layer;
+        row.append(make("figure", {}, canvas, make("figcaption", { text: caption, title: viewer.label(layer) })));
       }
       return make("div", {}, title, row);
     });

@@ -86,13 +86,15 @@ const viewer = (() => {
 
   function fit() {
     const info = data.images[image];
-    const room = stage.parentElement.clientWidth;
-    const height = Math.max(240, Math.min(window.innerHeight * 0.78, 760));
+    const room = byId("viewing").clientWidth;
+    const height = Math.max(240, Math.min(window.innerHeight * 0.82, 800));
     // Small images grow by whole numbers, so that all pixels have one size.
     const fits = Math.min(room / info.width, height / info.height);
     const scale = fits >= 2 ? Math.floor(fits) : fits;
     stage.classList.toggle("large", scale > 1);
-    stage.style.width = `${Math.min(room, info.width * scale)}px`;
+    const width = Math.min(room, info.width * scale);
+    byId("viewer").style.width = `${width}px`;
+    stage.style.width = `${width}px`;
     stage.style.aspectRatio = `${info.width} / ${info.height}`;
   }
 

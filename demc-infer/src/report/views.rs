@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use demc_data::Frame;
 use demc_model::metrics::Image;
 use jpeg_encoder::EncodingError;
+use rayon::prelude::*;
 use serde::Serialize;
 
 use super::codec::{Jpeg, Pixels, reduced};
@@ -90,7 +91,7 @@ impl Views<'_> {
         let reference = image(reference_hdr);
         let candidates = self.candidates();
         let maps: Vec<(&str, ErrorMap)> = candidates
-            .iter()
+            .par_iter()
             .map(|(name, planes)| (*name, ErrorMap::new(&image(planes), &reference)))
             .collect();
         let (_, of_denoised) = maps.last().expect("there is the denoised image");
@@ -131,20 +132,15 @@ impl Views<'_> {
             shares,
             quality: [u8::MAX, 0],
         };
-        let mut pictures = Urls::new();
+        let hdr = |(name, planes): &(&str, &[f32])| {
+            let pixels = Pixels::of_hdr(planes, height, width);
+            ((*name).to_owned(), pixels)
+        };
+        let error = |(name, map): &(&str, ErrorMap)| ((*name).to_owned(), map.pixels());
         // The noisy picture is first in the list.
-        let hdr = |planes: &[f32]| Pixels::of_hdr(planes, height, width);
-        for (name, planes) in &all[1..] {
-            let jpeg = purse.spend(&hdr(planes), CLEAN)?;
-            pictures.insert((*name).to_owned(), jpeg.url());
-        }
-        let mut errors = Urls::new();
-        for (name, map) in &maps {
-            let jpeg = purse.spend(&map.pixels(), ERRORS)?;
-            errors.insert((*name).to_owned(), jpeg.url());
-        }
-        let noisy = purse.spend(&hdr(&self.frame.color), NOISY)?;
-        pictures.insert("noisy".to_owned(), noisy.url());
+        let mut pictures = purse.spend(all[1..].iter().map(hdr).collect(), CLEAN)?;
+        let errors = purse.spend(maps.iter().map(error).collect(), ERRORS)?;
+        pictures.extend(purse.spend(vec![hdr(&all[0])], NOISY)?);
 
         let side = width.max(height).div_ceil(THUMBNAIL);
         let small = reduced(self.denoised, height, width, side);
@@ -178,12 +174,24 @@ struct Purse {
 }
 
 impl Purse {
-    fn spend(&mut self, pixels: &Pixels, shares: usize) -> Result<Jpeg, EncodingError> {
-        let jpeg = pixels.jpeg_within(self.left * shares / self.shares.max(1))?;
-        self.left = self.left.saturating_sub(jpeg.len());
-        self.shares -= shares;
-        let [worst, best] = self.quality;
-        self.quality = [worst.min(jpeg.quality), best.max(jpeg.quality)];
-        Ok(jpeg)
+    /// Pictures of one kind, of so many shares each, as JPEG.
+    fn spend(
+        &mut self,
+        pictures: Vec<(String, Pixels)>,
+        shares: usize,
+    ) -> Result<Urls, EncodingError> {
+        let budget = self.left * shares / self.shares.max(1);
+        self.shares -= shares * pictures.len();
+        let encoded = pictures
+            .into_par_iter()
+            .map(|(name, pixels)| Ok((name, pixels.jpeg_within(budget)?)));
+        let encoded: Vec<(String, Jpeg)> = encoded.collect::<Result<_, EncodingError>>()?;
+        for (_, jpeg) in &encoded {
+            self.left = self.left.saturating_sub(jpeg.len());
+            let [worst, best] = self.quality;
+            self.quality = [worst.min(jpeg.quality), best.max(jpeg.quality)];
+        }
+        let urls = encoded.into_iter().map(|(name, jpeg)| (name, jpeg.url()));
+        Ok(urls.collect())
     }
 }

@@ -69,6 +69,11 @@ impl<'a> Image<'a> {
         (self.height, self.width)
     }
 
+    /// Computes what several metrics share, before they are taken on several threads.
+    pub fn prepare(&self) {
+        self.appearance();
+    }
+
     /// Number of pixels.
     pub(super) fn pixels(&self) -> usize {
         self.height * self.width
@@ -76,7 +81,7 @@ impl<'a> Image<'a> {
 
     /// `clip(x, 0, 1)^(1 / 2.2)`, planar.
     pub(super) fn display(&self) -> &[f64] {
-        self.display.get_or_init(|| {
+        once::<Vec<f64>>(&self.display, || {
             let power = 1.0 / f64::from(DISPLAY_GAMMA);
             let shown = |x: &f32| f64::from(x.clamp(0.0, 1.0)).powf(power);
             self.hdr.par_iter().map(shown).collect()
@@ -85,13 +90,26 @@ impl<'a> Image<'a> {
 
     /// What FLIP compares.
     pub(super) fn appearance(&self) -> &Appearance {
-        self.appearance
-            .get_or_init(|| Appearance::new(self.display(), self.width))
+        once(&self.appearance, || {
+            Appearance::new(self.display(), self.width)
+        })
     }
 
     /// Fails a programmer who compares images of two sizes.
     pub(super) fn assert_size_of(&self, other: &Image) {
         assert_eq!(self.size(), other.size(), "images of one size");
+    }
+}
+
+/// What is in the cell, or what is computed for it. Not inside of it: a thread of the pool that waits for its parts may begin
+/// another metric, and would wait for itself.
+fn once<T>(cell: &OnceLock<T>, compute: impl FnOnce() -> T) -> &T {
+    match cell.get() {
+        Some(value) => value,
+        None => {
+            let value = compute();
+            cell.get_or_init(|| value)
+        }
     }
 }
 
