@@ -38,12 +38,14 @@
 //! - [`denoise`]: a frame to its denoised image, of any size: over [`padding`] and [`tiles`], within the [`memory`] that is there.
 //! - [`guard`]: what is refused and what is warned of, when an image is not what the network was trained on.
 //! - [`onnx`] writes the network for other runtimes, [`verify`](mod@verify) compares what those make of it with what this crate does.
-//! - [`evaluate`]: scores against a reference. [`picture`]: images to look at.
+//! - [`evaluate`]: scores against a reference, beside [`baseline`]s, with [`statistics`]. [`report`]: one page to look at them.
+//!   [`picture`]: images to look at.
 //! - [`device`], [`compute`]: what computes, and how.
 //!
 //! Training validates with exactly this code. Nothing here prints or exits; every error names the frame, file or channel.
 #![forbid(unsafe_code)]
 
+pub mod baseline;
 pub mod bundle;
 pub mod compute;
 pub mod denoise;
@@ -54,9 +56,12 @@ pub mod memory;
 pub mod onnx;
 pub mod padding;
 pub mod picture;
+pub mod report;
+pub mod statistics;
 pub mod tiles;
 pub mod verify;
 
+pub use baseline::{Baseline, BaselineError};
 pub use bundle::{Bundle, BundleError, BundleFile, BundleMeta, Names, Precision};
 pub use denoise::{DenoiseError, Denoised};
 pub use device::DeviceError;

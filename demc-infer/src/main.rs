@@ -1,4 +1,4 @@
-//! `demc-infer`: denoise, evaluate, export, import, inspect. See `cli`.
+//! `demc-infer`: what is done with a trained network, a verb a file. See `cli`.
 #![forbid(unsafe_code)]
 
 mod cli;

@@ -6,6 +6,7 @@ use std::fs;
 use std::path::Path;
 
 use common::{demc_infer, run_directory, sample};
+use demc_model::metrics::METRICS;
 use serde_json::Value;
 
 fn json(path: &Path) -> Value {
@@ -45,7 +46,13 @@ fn evaluate_prints_a_table_and_writes_the_same_numbers_as_json() {
             keys(image),
             ["name", "noisy", "black", "denoised", "reference_residual"]
         );
-        assert_eq!(keys(&image["noisy"]), ["relmse", "ssim"]);
+        let metrics = keys(&image["noisy"]);
+        assert_eq!(metrics[..2], ["relmse", "ssim"]);
+        let mut sorted = METRICS.map(|metric| metric.name);
+        sorted.sort_unstable();
+        let mut found: Vec<_> = metrics.iter().map(String::as_str).collect();
+        found.sort_unstable();
+        assert_eq!(found, sorted, "all metrics, always");
         // Black against any reference: at most 3, and near it for one well above sqrt(epsilon).
         let black = image["black"]["relmse"].as_f64().expect("number");
         assert!((1.0..3.0).contains(&black), "{black}");

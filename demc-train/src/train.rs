@@ -325,7 +325,7 @@ impl Run {
             loss,
             grad_norm,
         } = self.state.since_log;
-        let denoised = validation.map(|found| found.report.mean.denoised);
+        let denoised = validation.map(|found| &found.report.mean.denoised);
         let health = validation.map(|found| found.health);
         Line {
             step: self.state.step,

@@ -12,6 +12,8 @@ mod import;
 mod inputs;
 mod inspect;
 mod jobs;
+mod report;
+mod scenes;
 mod tiling;
 mod writing;
 
@@ -43,6 +45,7 @@ enum Command {
     Export(export::Export),
     Import(import::Import),
     Inspect(inspect::Inspect),
+    Report(report::Report),
 }
 
 /// Something asked for on the command line that cannot be: exit code 2.
@@ -60,6 +63,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<()> {
         Command::Export(command) => command.run(),
         Command::Import(command) => command.run(),
         Command::Inspect(command) => command.run(),
+        Command::Report(command) => command.run(),
     }
 }
 

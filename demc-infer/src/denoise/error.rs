@@ -1,6 +1,7 @@
 //! Why a frame could not be denoised.
 
 use burn::tensor::TensorReadError;
+use demc_model::metrics::ImageError;
 
 use crate::guard::FARTHEST_RMS;
 use crate::memory::TooLarge;
@@ -66,6 +67,16 @@ pub enum DenoiseError {
         name: String,
         /// What the device said.
         source: TensorReadError,
+    },
+    /// An image with values that are not finite has no score.
+    #[error("{name}: {what}")]
+    Image {
+        /// The frame.
+        name: String,
+        /// Which image of it.
+        what: String,
+        /// How many.
+        source: ImageError,
     },
     /// There is nothing to compare with.
     #[error("{name}: no reference in the file")]

@@ -2,9 +2,10 @@
 
 use anyhow::ensure;
 use demc_infer::evaluate::{ImageScore, Score};
+use demc_infer::statistics::Estimate;
+use demc_model::metrics::Better;
 use serde::{Deserialize, Serialize};
 
-use super::statistics::Estimate;
 use super::{Finished, Spec};
 
 /// A comparison of variants on the images of the test split.
@@ -118,24 +119,11 @@ impl Comparison {
         let verdict = |row: &Row| {
             let relmse = row
                 .relmse_difference
-                .map(|found| ("RelMSE", found, found.mean < 0.0));
+                .map(|found| found.verdict("RelMSE", Better::Lower));
             let ssim = row
                 .ssim_difference
-                .map(|found| ("SSIM", found, found.mean > 0.0));
-            let words = [relmse, ssim].into_iter().flatten().map(|(metric, found, better)| {
-                let [low, high] = found.interval;
-                match (found.is_significant(), better) {
-                    (false, _) => format!(
-                        "no significant difference in {metric} ({:+.4}, 95 % {low:+.4} to {high:+.4})",
-                        found.mean
-                    ),
-                    (true, better) => format!(
-                        "{} in {metric} ({:+.4}, 95 % {low:+.4} to {high:+.4})",
-                        if better { "better" } else { "worse" },
-                        found.mean
-                    ),
-                }
-            });
+                .map(|found| found.verdict("SSIM", Better::Higher));
+            let words = [relmse, ssim].into_iter().flatten();
             let words: Vec<String> = words.collect();
             format!("{} against {}: {}", row.name, first.name, words.join("; "))
         };

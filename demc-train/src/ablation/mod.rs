@@ -5,7 +5,6 @@
 
 mod comparison;
 mod spec;
-mod statistics;
 mod table;
 
 use std::fs;
@@ -21,8 +20,8 @@ use crate::metrics_log;
 use crate::progress::say;
 use crate::session::{Manner, Outcome, Session};
 pub use comparison::{Comparison, Row};
+pub use demc_infer::statistics::{Estimate, RESAMPLES};
 pub use spec::{Spec, Variant};
-pub use statistics::{Estimate, RESAMPLES};
 
 /// Scores of the test split in a run directory.
 const SCORES: &str = "test.json";

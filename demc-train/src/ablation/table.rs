@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use demc_data::file::write_whole;
 
-use super::statistics::{Estimate, RESAMPLES};
 use super::{Comparison, Row};
 use crate::chart::{Bar, BarPanel, Figure, Scale};
+use demc_infer::statistics::{Estimate, RESAMPLES};
 
 /// Name of all files, without ending.
 const STEM: &str = "ablation";

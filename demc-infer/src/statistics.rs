@@ -5,6 +5,7 @@
 //! quantiles of such means. Comparisons are paired: the cells are differences of two variants on the same image, trained
 //! from the same seed on the same batches.
 
+use demc_model::metrics::Better;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -70,6 +71,18 @@ impl Estimate {
         Self::of(&rows.collect::<Vec<_>>())
     }
 
+    /// What a difference in `metric` says, in words.
+    pub fn verdict(&self, metric: &str, better: Better) -> String {
+        let word = match (self.is_significant(), better.prefers(self.mean)) {
+            (false, _) => "no significant difference",
+            (true, true) => "better",
+            (true, false) => "worse",
+        };
+        let [low, high] = self.interval;
+        let mean = self.mean;
+        format!("{word} in {metric} ({mean:+.4}, 95 % {low:+.4} to {high:+.4})")
+    }
+
     /// Whether zero lies outside of the interval.
     pub fn is_significant(&self) -> bool {
         self.interval[0] > 0.0 || self.interval[1] < 0.0
@@ -109,6 +122,22 @@ mod tests {
         assert!(!difference.is_significant());
         assert_eq!(Estimate::of(&[]), None);
         assert_eq!(Estimate::of(&[vec![]]), None);
+    }
+
+    #[test]
+    fn a_verdict_knows_which_way_is_better() {
+        let found = |mean, interval| Estimate { mean, interval };
+        assert_eq!(
+            found(-0.5, [-0.75, -0.25]).verdict("relmse", Better::Lower),
+            "better in relmse (-0.5000, 95 % -0.7500 to -0.2500)"
+        );
+        let worse = found(-0.5, [-0.75, -0.25]).verdict("ssim", Better::Higher);
+        assert!(worse.starts_with("worse in ssim"), "{worse}");
+        let none = found(-0.5, [-0.75, 0.25]).verdict("flip", Better::Lower);
+        assert!(
+            none.starts_with("no significant difference in flip"),
+            "{none}"
+        );
     }
 
     /// Of one seed, the interval is that of the mean of n values: 1.96 deviations by sqrt(n) on both sides.

@@ -1,0 +1,334 @@
+//! Scores of a network: what all metrics say of the noisy, an all-black and the denoised image against the reference,
+//! and of other programs' images of the same scenes.
+//!
+//! The black image is there because being better than the noisy one proves nothing: at few samples a pixel, black
+//! itself is (about 2.5 to 3 in RelMSE). The reference has an error of its own, the residual; a score near it means
+//! nothing either.
+
+mod difference;
+mod table;
+
+use std::collections::BTreeMap;
+
+use demc_data::Frame;
+use demc_model::metrics::{self, Image, METRICS};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::Bundle;
+use crate::denoise::DenoiseError;
+pub use difference::{Difference, FEW_IMAGES};
+
+/// How near an image is to its reference.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Score {
+    /// Eq. 5: summed over rgb, averaged over pixels, epsilon 0.001, linear HDR. Smaller is better.
+    pub relmse: f64,
+    /// Wang et al. 2004 on `clip(x, 0, 1)^(1 / 2.2)`, at most 1; `None` for an image below its 11x11 window.
+    pub ssim: Option<f64>,
+    /// The other metrics of [`METRICS`] by name, where they were asked for; `None` for one without a value.
+    #[serde(flatten)]
+    pub others: BTreeMap<String, Option<f64>>,
+}
+
+impl Score {
+    /// The headlines of `candidate` against `reference`.
+    pub fn headline(candidate: &Image, reference: &Image) -> Self {
+        Self {
+            relmse: metrics::rel_mse(candidate, reference),
+            ssim: metrics::ssim(candidate, reference),
+            others: BTreeMap::new(),
+        }
+    }
+
+    /// All metrics of `candidate` against `reference`.
+    pub fn full(candidate: &Image, reference: &Image) -> Self {
+        candidate.prepare();
+        reference.prepare();
+        let values = METRICS.par_iter().map(|m| (m.of)(candidate, reference));
+        let values: Vec<Option<f64>> = values.collect();
+        let mut others: BTreeMap<String, Option<f64>> = METRICS
+            .iter()
+            .zip(values)
+            .map(|(metric, value)| (metric.name.to_owned(), value))
+            .collect();
+        Self {
+            relmse: others.remove("relmse").flatten().expect("always a value"),
+            ssim: others.remove("ssim").flatten(),
+            others,
+        }
+    }
+
+    /// The value of the metric called `name`, where it was asked for and has one.
+    pub fn get(&self, name: &str) -> Option<f64> {
+        match name {
+            "relmse" => Some(self.relmse),
+            "ssim" => self.ssim,
+            name => self.others.get(name).copied().flatten(),
+        }
+    }
+
+    /// The mean of each number, over the images that have it.
+    fn mean(scores: &[&Score]) -> Self {
+        let average = |of: &dyn Fn(&Score) -> Option<f64>| {
+            let (count, sum) = scores
+                .iter()
+                .filter_map(|score| of(score))
+                .fold((0.0, 0.0), |(n, sum), value| (n + 1.0, sum + value));
+            (count > 0.0).then(|| sum / count)
+        };
+        let names = scores.first().map(|score| score.others.keys());
+        let others = names.into_iter().flatten().map(|name| {
+            let mean = average(&|score| score.get(name));
+            (name.clone(), mean)
+        });
+        Self {
+            relmse: average(&|score| Some(score.relmse)).unwrap_or(f64::NAN),
+            ssim: average(&|score| score.ssim),
+            others: others.collect(),
+        }
+    }
+}
+
+fn is_headline(name: &str) -> bool {
+    matches!(name, "relmse" | "ssim")
+}
+
+/// The scores of one image.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ImageScore {
+    /// The image.
+    pub name: String,
+    /// The input.
+    pub noisy: Score,
+    /// An image of zeros.
+    pub black: Score,
+    /// The network's output.
+    pub denoised: Score,
+    /// Other programs' outputs, by the name they were given.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub baselines: BTreeMap<String, Score>,
+    /// RelMSE of the reference against a perfect one, where the data set knows it.
+    pub reference_residual: Option<f64>,
+}
+
+impl ImageScore {
+    /// The headline scores of `frame` and its denoised image (planar `[3, H, W]`, linear HDR).
+    ///
+    /// # Errors
+    /// [`DenoiseError::NoReference`] for a frame without reference, [`DenoiseError::Image`] for values that are not
+    /// finite.
+    pub fn new(
+        frame: &Frame,
+        denoised: &[f32],
+        reference_residual: Option<f64>,
+    ) -> Result<Self, DenoiseError> {
+        Self::measure(frame, denoised, &[], reference_residual, Score::headline)
+    }
+
+    /// The scores of `frame`, its denoised image and other programs' images of it, in all metrics.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn full(
+        frame: &Frame,
+        denoised: &[f32],
+        baselines: &[(&str, &[f32])],
+        reference_residual: Option<f64>,
+    ) -> Result<Self, DenoiseError> {
+        Self::measure(frame, denoised, baselines, reference_residual, Score::full)
+    }
+
+    fn measure(
+        frame: &Frame,
+        denoised: &[f32],
+        baselines: &[(&str, &[f32])],
+        reference_residual: Option<f64>,
+        score: fn(&Image, &Image) -> Score,
+    ) -> Result<Self, DenoiseError> {
+        let image = |what: &str, planes| {
+            Image::new(planes, frame.height, frame.width).map_err(|source| DenoiseError::Image {
+                name: frame.name.clone(),
+                what: what.to_owned(),
+                source,
+            })
+        };
+        let reference = frame.reference.as_deref();
+        let reference = reference.ok_or_else(|| DenoiseError::NoReference {
+            name: frame.name.clone(),
+        })?;
+        let zeros = vec![0.0; reference.len()];
+        let reference = image("reference", reference)?;
+        let score = |what: &str, planes| Ok(score(&image(what, planes)?, &reference));
+        let baselines = baselines
+            .iter()
+            .map(|(name, planes)| Ok(((*name).to_owned(), score(name, planes)?)));
+        Ok(Self {
+            name: frame.name.clone(),
+            noisy: score("noisy image", &frame.color)?,
+            black: score("black image", &zeros)?,
+            denoised: score("denoised image", denoised)?,
+            baselines: baselines.collect::<Result<_, DenoiseError>>()?,
+            reference_residual,
+        })
+    }
+
+    /// All that was scored, by name: `noisy`, `black`, the baselines, `denoised`.
+    pub fn methods(&self) -> Vec<(&str, &Score)> {
+        methods(&self.noisy, &self.black, &self.baselines, &self.denoised)
+    }
+}
+
+fn methods<'a>(
+    noisy: &'a Score,
+    black: &'a Score,
+    baselines: &'a BTreeMap<String, Score>,
+    denoised: &'a Score,
+) -> Vec<(&'a str, &'a Score)> {
+    let baselines = baselines.iter().map(|(name, score)| (name.as_str(), score));
+    [("noisy", noisy), ("black", black)]
+        .into_iter()
+        .chain(baselines)
+        .chain([("denoised", denoised)])
+        .collect()
+}
+
+/// Denoises `frame` and takes its headline scores: one image in memory at a time.
+///
+/// # Errors
+/// As [`Bundle::denoise`], and for a frame without reference.
+pub fn score(
+    bundle: &Bundle,
+    frame: &Frame,
+    reference_residual: Option<f64>,
+) -> Result<ImageScore, DenoiseError> {
+    ImageScore::new(frame, &bundle.denoise(frame)?, reference_residual)
+}
+
+/// The means over a report's images.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MeanScore {
+    /// Of the inputs.
+    pub noisy: Score,
+    /// Of images of zeros.
+    pub black: Score,
+    /// Of the network's outputs.
+    pub denoised: Score,
+    /// Of other programs' outputs.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub baselines: BTreeMap<String, Score>,
+}
+
+impl MeanScore {
+    /// As [`ImageScore::methods`].
+    pub fn methods(&self) -> Vec<(&str, &Score)> {
+        methods(&self.noisy, &self.black, &self.baselines, &self.denoised)
+    }
+}
+
+/// The scores of several images and their mean. [`Display`](std::fmt::Display) is a Markdown table of the headlines; the
+/// JSON of `serde` is `{"images": [...], "mean": {...}}`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Report {
+    /// One score an image, in the order given.
+    pub images: Vec<ImageScore>,
+    /// Their mean; every image counts the same.
+    pub mean: MeanScore,
+}
+
+impl Report {
+    /// The report on these images, which have the same baselines.
+    pub fn new(images: Vec<ImageScore>) -> Self {
+        let mean = |of: &dyn Fn(&ImageScore) -> Option<&Score>| {
+            Score::mean(&images.iter().filter_map(of).collect::<Vec<_>>())
+        };
+        let baselines = images.first().map(|image| image.baselines.keys());
+        let baselines = baselines.into_iter().flatten().map(|name| {
+            let mean = mean(&|image| image.baselines.get(name));
+            (name.clone(), mean)
+        });
+        let mean = MeanScore {
+            noisy: mean(&|image| Some(&image.noisy)),
+            black: mean(&|image| Some(&image.black)),
+            denoised: mean(&|image| Some(&image.denoised)),
+            baselines: baselines.collect(),
+        };
+        Self { images, mean }
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+
+    pub fn image(name: &str, relmse: f64, ssim: Option<f64>) -> ImageScore {
+        let score = Score {
+            relmse,
+            ssim,
+            others: BTreeMap::new(),
+        };
+        ImageScore {
+            name: name.into(),
+            noisy: score.clone(),
+            black: score.clone(),
+            denoised: score,
+            baselines: BTreeMap::new(),
+            reference_residual: Some(0.1),
+        }
+    }
+
+    #[test]
+    fn the_mean_counts_every_image_once_and_skips_a_missing_ssim() {
+        let report = Report::new(vec![image("a", 1.0, Some(0.5)), image("b", 3.0, None)]);
+        let expected = Score {
+            relmse: 2.0,
+            ssim: Some(0.5),
+            others: BTreeMap::new(),
+        };
+        assert_eq!(report.mean.denoised, expected);
+        assert_eq!(report.mean.noisy, expected);
+    }
+
+    #[test]
+    fn a_frame_without_reference_is_named() {
+        let frame = crate::bundle::testing::frame(4, 4);
+        let error = ImageScore::new(&frame, &frame.color, None).expect_err("no reference");
+        assert_eq!(error.to_string(), "pattern: no reference in the file");
+    }
+
+    #[test]
+    fn json_has_every_metric_beside_the_headlines_and_reads_back() {
+        let mut frame = crate::bundle::testing::frame(50, 44);
+        frame.reference = Some(frame.color.iter().map(|x| x + 0.1).collect());
+        let other = vec![0.25; frame.color.len()];
+        let baselines = [("other", other.as_slice())];
+        let score = ImageScore::full(&frame, &frame.color, &baselines, None).expect("scored");
+        assert_eq!(score.denoised, score.noisy);
+        let report = Report::new(vec![score]);
+        let json = serde_json::to_value(&report).expect("JSON");
+        for metric in METRICS {
+            assert!(
+                json["mean"]["baselines"]["other"][metric.name].is_f64(),
+                "{json}"
+            );
+            assert!(json["images"][0]["noisy"][metric.name].is_f64(), "{json}");
+        }
+        let back: Report = serde_json::from_value(json).expect("a report");
+        assert_eq!(back, report);
+    }
+
+    #[test]
+    fn a_candidate_that_is_not_finite_is_named_and_counted() {
+        let mut frame = crate::bundle::testing::frame(4, 4);
+        frame.reference = Some(frame.color.clone());
+        let mut bad = frame.color.clone();
+        bad[3] = f32::NAN;
+        let baselines = [("other", bad.as_slice())];
+        let error = ImageScore::full(&frame, &frame.color, &baselines, None).expect_err("NaN");
+        let source = std::error::Error::source(&error).expect("a source");
+        assert_eq!(
+            format!("{error}: {source}"),
+            "pattern: other: 1 NaN or infinite values in 1 pixels"
+        );
+    }
+}

@@ -1,0 +1,176 @@
+//! A report as a Markdown table: a row an image, and for each metric a column for each thing that was scored.
+
+use std::fmt;
+
+use demc_model::metrics::{METRICS, Metric};
+
+use super::{Report, Score, is_headline};
+
+/// What a score without a value looks like.
+const NONE: &str = "-";
+
+impl Report {
+    /// The headlines, and `more` metrics, as a Markdown table that ends with what the columns mean.
+    pub fn table(&self, more: &[&Metric]) -> String {
+        let headlines = METRICS.iter().filter(|metric| is_headline(metric.name));
+        let more = more.iter().copied().filter(|m| !is_headline(m.name));
+        let metrics: Vec<&Metric> = headlines.chain(more).collect();
+        let methods = self.mean.methods();
+        let mut rows = vec![head(&metrics, &methods)];
+        rows.extend(self.images.iter().map(|image| {
+            let residual = image.reference_residual;
+            row(&image.name, &metrics, &image.methods(), residual)
+        }));
+        rows.push(row("mean", &metrics, &methods, None));
+        format!("{}\n{}", aligned(&rows), legend(&metrics))
+    }
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.table(&[]))
+    }
+}
+
+/// What a metric is called at the head of a column.
+fn label(metric: &Metric) -> &'static str {
+    match metric.name {
+        "relmse" => "RelMSE",
+        "ssim" => "SSIM",
+        name => name,
+    }
+}
+
+/// The metric stands before the first column of its group only, so that the table stays narrow.
+fn head(metrics: &[&Metric], methods: &[(&str, &Score)]) -> Vec<String> {
+    let mut cells = vec!["image".to_owned()];
+    for metric in metrics {
+        for (i, (name, _)) in methods.iter().enumerate() {
+            let name = escaped(name);
+            cells.push(match i {
+                0 => format!("{} {name}", label(metric)),
+                _ => name,
+            });
+        }
+        if metric.name == "relmse" {
+            cells.push("reference residual".to_owned());
+        }
+    }
+    cells
+}
+
+fn row(
+    name: &str,
+    metrics: &[&Metric],
+    methods: &[(&str, &Score)],
+    residual: Option<f64>,
+) -> Vec<String> {
+    let number = |value: Option<f64>| value.map_or(NONE.into(), |v| format!("{v:.4}"));
+    let mut cells = vec![escaped(name)];
+    for metric in metrics {
+        cells.extend(methods.iter().map(|(_, s)| number(s.get(metric.name))));
+        if metric.name == "relmse" {
+            cells.push(number(residual));
+        }
+    }
+    cells
+}
+
+/// A name that cannot end its cell.
+fn escaped(name: &str) -> String {
+    name.replace('|', "\\|")
+}
+
+/// Rows of one width, a rule under the first; the first column to the left, the others to the right.
+fn aligned(rows: &[Vec<String>]) -> String {
+    let width = |column: usize| rows.iter().map(|r| r[column].chars().count()).max();
+    let widths: Vec<usize> = (0..rows[0].len()).filter_map(width).collect();
+    let rule = widths.iter().enumerate().map(|(i, &width)| match i {
+        0 => "-".repeat(width),
+        _ => "-".repeat(width - 1) + ":",
+    });
+    let rule: Vec<String> = rule.collect();
+    let mut out = String::new();
+    for cells in rows[..1].iter().chain([&rule]).chain(&rows[1..]) {
+        for (i, (cell, width)) in cells.iter().zip(&widths).enumerate() {
+            out += &match i {
+                0 => format!("| {cell:<width$} |"),
+                _ => format!(" {cell:>width$} |"),
+            };
+        }
+        out.push('\n');
+    }
+    out
+}
+
+fn legend(metrics: &[&Metric]) -> String {
+    let headlines = "RelMSE: Eq. 5, summed over rgb, linear HDR, smaller is better. \
+         SSIM: Wang et al. 2004 on clip(x, 0, 1)^(1/2.2), larger is better.";
+    let others = metrics.iter().filter(|metric| !is_headline(metric.name));
+    let others = others.map(|metric| {
+        let Metric {
+            name, definition, ..
+        } = metric;
+        format!("\n{name}: {definition}; best {}.", metric.better.phrase())
+    });
+    headlines.to_owned() + &others.collect::<String>()
+}
+
+#[cfg(test)]
+mod tests {
+    use demc_model::metrics;
+
+    use super::super::tests::image;
+    use super::*;
+
+    #[test]
+    fn the_rows_of_the_table_have_one_width() {
+        let report = Report::new(vec![
+            image("a", 1.0, None),
+            image("a-long-name", 1234.5, Some(0.5)),
+        ]);
+        let table = report.to_string();
+        let lines: Vec<_> = table
+            .lines()
+            .take_while(|line| line.starts_with('|'))
+            .collect();
+        assert_eq!(lines.len(), 5);
+        assert!(
+            lines.iter().all(|line| line.len() == lines[0].len()),
+            "{table}"
+        );
+        assert!(lines[4].starts_with("| mean "), "{table}");
+    }
+
+    #[test]
+    fn columns_are_added_for_metrics_and_baselines() {
+        let mut score = image("a|b", 1.0, Some(0.5));
+        score.baselines.insert("other".into(), score.noisy.clone());
+        let smape = metrics::find("smape").expect("a row");
+        let table = Report::new(vec![score]).table(&[smape]);
+        let head = table.lines().next().expect("a head");
+        let cells: Vec<_> = head.split('|').map(str::trim).collect();
+        assert_eq!(
+            cells[1..],
+            [
+                "image",
+                "RelMSE noisy",
+                "black",
+                "other",
+                "denoised",
+                "reference residual",
+                "SSIM noisy",
+                "black",
+                "other",
+                "denoised",
+                "smape noisy",
+                "black",
+                "other",
+                "denoised",
+                "",
+            ]
+        );
+        assert!(table.contains("| a\\|b  |"), "{table}");
+        assert!(table.contains("\nsmape: mean over values"), "{table}");
+    }
+}

@@ -1,0 +1,216 @@
+//! One HTML file about a model: its images beside the noisy ones, the references and other programs', and all numbers.
+//!
+//! The page is `page.html` with `style.css` and the scripts in it, the numbers as JSON, and each scene's pictures as JSON of
+//! their own that is parsed when the scene is looked at. Every name goes through JSON and `textContent`, never through
+//! HTML. A content security policy forbids it the network.
+
+mod codec;
+mod error_map;
+mod views;
+
+use demc_model::metrics::METRICS;
+use serde::Serialize;
+use serde_json::json;
+
+use crate::evaluate::{FEW_IMAGES, ImageScore, Report};
+use views::Encoded;
+pub use views::Views;
+
+/// Bytes of all pictures before base64, which makes 4 of 3: the page stays below 20 MB.
+const BUDGET: usize = 14_000_000;
+
+const TEMPLATE: &str = include_str!("page.html");
+const STYLE: &str = include_str!("style.css");
+const SCRIPTS: [&str; 5] = [
+    include_str!("dom.js"),
+    include_str!("viewer.js"),
+    include_str!("insets.js"),
+    include_str!("tables.js"),
+    include_str!("charts.js"),
+];
+
+/// Why a page could not be made.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ReportError {
+    /// A picture could not be encoded.
+    #[error("{name}: its pictures cannot be encoded")]
+    Encoding {
+        /// The image.
+        name: String,
+        /// What the encoder said.
+        source: jpeg_encoder::EncodingError,
+    },
+    /// The numbers could not be written.
+    #[error("the report's JSON")]
+    Json(#[from] serde_json::Error),
+}
+
+/// What a page is about.
+#[derive(Debug, Clone, Serialize)]
+pub struct About {
+    /// What computed the denoised images.
+    pub model: String,
+    /// The data set.
+    pub data: String,
+    /// Its part.
+    pub split: String,
+}
+
+/// A page under way. Holds encoded pictures only.
+#[derive(Default)]
+pub struct Page {
+    images: Vec<serde_json::Value>,
+    pictures: Vec<String>,
+}
+
+impl Page {
+    /// Adds a scene with its `score`, one of `scenes`.
+    ///
+    /// # Errors
+    /// A picture that cannot be encoded.
+    ///
+    /// # Panics
+    /// Where the frame has no reference, or an image holds values that are not finite.
+    pub fn add(
+        &mut self,
+        views: &Views,
+        score: &ImageScore,
+        scenes: usize,
+    ) -> Result<(), ReportError> {
+        let encoded = views.encode(BUDGET / scenes.max(1));
+        let encoded = encoded.map_err(|source| ReportError::Encoding {
+            name: score.name.clone(),
+            source,
+        })?;
+        let Encoded {
+            pictures,
+            thumbnail,
+            block,
+            quality,
+        } = encoded;
+        self.images.push(json!({
+            "name": score.name,
+            "width": views.frame.width,
+            "height": views.frame.height,
+            "residual": score.reference_residual,
+            "scores": by_name(&score.methods())?,
+            "thumbnail": thumbnail,
+            "block": block,
+            "quality": quality,
+        }));
+        self.pictures.push(script_json(&pictures)?);
+        Ok(())
+    }
+
+    /// The file, with what `report` says of all scenes.
+    ///
+    /// # Errors
+    /// [`ReportError::Json`].
+    pub fn html(&self, about: &About, report: &Report) -> Result<String, ReportError> {
+        let metrics = METRICS.iter().map(|metric| {
+            json!({
+                "name": metric.name,
+                "definition": metric.definition,
+                "better": metric.better.word(),
+            })
+        });
+        let methods = report.mean.methods();
+        let names: Vec<&str> = methods.iter().map(|(name, _)| *name).collect();
+        let data = json!({
+            "about": about,
+            "version": env!("CARGO_PKG_VERSION"),
+            "metrics": metrics.collect::<Vec<_>>(),
+            "methods": names,
+            "images": self.images,
+            "mean": by_name(&methods)?,
+            "differences": report.differences(),
+            "fewImages": FEW_IMAGES,
+            "curve": { "white": codec::WHITE, "toe": codec::TOE },
+            "errorScale": error_map::SCALE,
+        });
+        let mut json = element("data", &script_json(&data)?);
+        for (i, pictures) in self.pictures.iter().enumerate() {
+            json += &element(&format!("pictures-{i}"), pictures);
+        }
+        let parts = [
+            ("{{style}}", STYLE),
+            ("{{json}}", &json),
+            ("{{script}}", &SCRIPTS.join("\n")),
+        ];
+        Ok(filled(TEMPLATE, &parts))
+    }
+}
+
+/// Scores by the name of what was scored.
+fn by_name(methods: &[(&str, &crate::Score)]) -> Result<serde_json::Value, serde_json::Error> {
+    let scores = methods.iter().map(|(name, score)| {
+        let score = serde_json::to_value(score)?;
+        Ok(((*name).to_owned(), score))
+    });
+    Ok(serde_json::Value::Object(scores.collect::<Result<_, _>>()?))
+}
+
+/// JSON that cannot end the script element around it.
+fn script_json(value: &impl Serialize) -> Result<String, serde_json::Error> {
+    Ok(serde_json::to_string(value)?.replace('<', "\\u003c"))
+}
+
+fn element(id: &str, json: &str) -> String {
+    format!("<script type=\"application/json\" id=\"{id}\">{json}</script>\n")
+}
+
+/// The template with each mark replaced, in the order of the marks. What was put in is not looked at again.
+fn filled(template: &str, parts: &[(&str, &str)]) -> String {
+    let mut rest = template;
+    let mut out = String::new();
+    for (mark, text) in parts {
+        let (before, after) = rest.split_once(mark).expect("the template has every mark");
+        out += before;
+        out += text;
+        rest = after;
+    }
+    out + rest
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_name_ends_its_script_element() {
+        let mut frame = crate::bundle::testing::frame(60, 50);
+        frame.reference = Some(frame.color.iter().map(|x| x + 0.1).collect());
+        frame.name = "</script><script>alert(1)</script>{{script}}".into();
+        let planes = frame.color.clone();
+        let baselines = [("<b>&amp;", planes.as_slice())];
+        let score = ImageScore::full(&frame, &planes, &baselines, None).expect("scored");
+        let views = Views {
+            frame: &frame,
+            denoised: &planes,
+            baselines: &baselines,
+        };
+        let mut page = Page::default();
+        page.add(&views, &score, 1).expect("encoded");
+        let about = About {
+            model: "<!-- model".into(),
+            data: "data".into(),
+            split: "test".into(),
+        };
+        let html = page
+            .html(&about, &Report::new(vec![score]))
+            .expect("a page");
+        let ends = |text: &str| text.matches("</script").count();
+        assert_eq!(ends(&html), ends(TEMPLATE) + 2);
+        assert!(!html.contains("<b>&amp;") && !html.contains("<!-- model"));
+        assert!(html.contains("\\u003c/script>\\u003cscript>alert(1)\\u003c/script>{{script}}"));
+        let start = html.find("id=\"data\">").expect("numbers") + "id=\"data\">".len();
+        let end = start + html[start..].find("</script").expect("an end");
+        let data: serde_json::Value = serde_json::from_str(&html[start..end]).expect("JSON");
+        assert_eq!(data["images"][0]["name"], frame.name);
+        assert_eq!(
+            data["methods"],
+            json!(["noisy", "black", "<b>&amp;", "denoised"])
+        );
+    }
+}

@@ -1,0 +1,194 @@
+//! LDR-FLIP: "FLIP: A Difference Evaluator for Alternating Images", Andersson et al., HPG 2020.
+//!
+//! Both images are filtered by what an eye resolves at 67 pixels a degree, compared by colour, and the difference is
+//! raised where edges or points appear or vanish. Written here because the crate that wraps NVIDIA's C++ takes 8 bits a
+//! channel, needs a C++ compiler, and had its last release in 2023; the tests compare with NVIDIA's own Python package.
+
+use std::f32::consts::PI;
+
+use rayon::prelude::*;
+
+use super::Image;
+use super::color::{
+    Color, hunt_lab_from_linear, hyab, linear_from_opponent, linear_from_srgb, opponent_from_linear,
+};
+use super::filter::{Edge, separable};
+
+/// Pixels a degree of the viewer's angle: 0.7 m from a monitor that is 0.7 m and 3840 pixels wide (the paper's).
+const PIXELS_PER_DEGREE: f32 = 0.7 * 3840.0 / 0.7 * (PI / 180.0);
+/// Contrast sensitivity of Y, Cx and Cz: two Gaussians `(a, b)` each.
+const SENSITIVITY: [[(f32, f32); 2]; 3] = [
+    [(1.0, 0.0047), (0.0, 1e-5)],
+    [(1.0, 0.0053), (0.0, 1e-5)],
+    [(34.1, 0.04), (13.5, 0.025)],
+];
+/// Widest of them.
+const WIDEST: f32 = 0.04;
+/// Width of the edge and point detectors, degrees.
+const FEATURE_WIDTH: f32 = 0.082;
+/// Exponents of the colour and of the feature difference.
+const COLOR_POWER: f32 = 0.7;
+const FEATURE_POWER: f32 = 0.5;
+/// Below this share of the largest colour difference, errors take up to [`KNEE_VALUE`] of the scale.
+const KNEE: f32 = 0.4;
+const KNEE_VALUE: f32 = 0.95;
+
+/// Mean `flip` of an image, 0 to 1.
+///
+/// # Panics
+/// Where the sizes differ.
+pub fn flip(candidate: &Image, reference: &Image) -> f64 {
+    candidate.assert_size_of(reference);
+    let (a, b) = (candidate.appearance(), reference.appearance());
+    let largest = hyab(
+        hunt_lab_from_linear([0.0, 1.0, 0.0]),
+        hunt_lab_from_linear([0.0, 0.0, 1.0]),
+    )
+    .powf(COLOR_POWER);
+    let knee = KNEE * largest;
+    let colors = a.lab.par_iter().zip(&b.lab);
+    let features = a.features.par_iter().zip(&b.features);
+    let errors: Vec<f32> = colors
+        .zip(features)
+        .map(|((&x, &y), (&[edge_x, point_x], &[edge_y, point_y]))| {
+            let color = hyab(x, y).powf(COLOR_POWER);
+            let color = if color < knee {
+                color * KNEE_VALUE / knee
+            } else {
+                KNEE_VALUE + (color - knee) / (largest - knee) * (1.0 - KNEE_VALUE)
+            };
+            let feature = (edge_x - edge_y).abs().max((point_x - point_y).abs());
+            let feature = (feature / 2.0_f32.sqrt()).powf(FEATURE_POWER);
+            color.powf(1.0 - feature)
+        })
+        .collect();
+    errors.iter().map(|e| f64::from(*e)).sum::<f64>() / errors.len() as f64
+}
+
+/// What FLIP sees of an image.
+pub(super) struct Appearance {
+    /// Filtered colours.
+    lab: Vec<Color>,
+    /// Strength of edges and of points.
+    features: Vec<[f32; 2]>,
+}
+
+impl Appearance {
+    /// Of display values in 0 to 1, planar.
+    pub(super) fn new(display: &[f64], width: usize) -> Self {
+        let pixels = display.len() / 3;
+        let opponent: Vec<Color> = (0..pixels)
+            .into_par_iter()
+            .map(|i| {
+                let value = |c: usize| linear_from_srgb(display[c * pixels + i] as f32);
+                opponent_from_linear([value(0), value(1), value(2)])
+            })
+            .collect();
+        let plane = |c: usize| opponent.iter().map(|color| color[c]).collect::<Vec<f32>>();
+        let seen: [Vec<f32>; 3] =
+            std::array::from_fn(|c| sensitivity(&plane(c), width, SENSITIVITY[c]));
+        let lab = (0..pixels)
+            .into_par_iter()
+            .map(|i| {
+                let rgb = linear_from_opponent([seen[0][i], seen[1][i], seen[2][i]]);
+                hunt_lab_from_linear(rgb.map(|x| x.clamp(0.0, 1.0)))
+            })
+            .collect();
+        let grey: Vec<f32> = opponent.iter().map(|c| (c[0] + 16.0) / 116.0).collect();
+        Self {
+            lab,
+            features: features(&grey, width),
+        }
+    }
+}
+
+/// A plane filtered by a contrast sensitivity, a sum of two Gaussians that together weigh 1.
+fn sensitivity(plane: &[f32], width: usize, gaussians: [(f32, f32); 2]) -> Vec<f32> {
+    let radius = (3.0 * (WIDEST / (2.0 * PI * PI)).sqrt() * PIXELS_PER_DEGREE).ceil() as i32;
+    let taps = |b: f32| -> Vec<f32> {
+        let degrees = (-radius..=radius).map(|i| i as f32 / PIXELS_PER_DEGREE);
+        degrees.map(|x| (-PI * PI * x * x / b).exp()).collect()
+    };
+    let weighted = gaussians.map(|(a, b)| (a * (PI / b).sqrt(), taps(b)));
+    let total: f32 = weighted
+        .iter()
+        .map(|(weight, taps)| weight * taps.iter().sum::<f32>().powi(2))
+        .sum();
+    let mut out = vec![0.0; plane.len()];
+    for (weight, taps) in weighted.iter().filter(|(weight, _)| *weight > 0.0) {
+        let part = separable(plane, width, taps, taps, Edge::Replicate);
+        for (out, part) in out.iter_mut().zip(part) {
+            *out += weight / total * part;
+        }
+    }
+    out
+}
+
+/// Strength of edges and points of a plane of 0 to 1: first and second derivatives of a Gaussian.
+fn features(grey: &[f32], width: usize) -> Vec<[f32; 2]> {
+    let deviation = 0.5 * FEATURE_WIDTH * PIXELS_PER_DEGREE;
+    let radius = (3.0 * deviation).ceil() as i32;
+    let taps = |of: fn(f32) -> f32| -> Vec<f32> {
+        let places = (-radius..=radius).map(|i| i as f32 / deviation);
+        let raw: Vec<f32> = places.map(|x| of(x) * (-x * x / 2.0).exp()).collect();
+        // Positive and negative taps weigh 1 each.
+        let weight = |sign: f32| raw.iter().map(|t| (t * sign).max(0.0)).sum::<f32>();
+        let (positive, negative) = (weight(1.0), weight(-1.0));
+        raw.iter()
+            .map(|&t| {
+                t / if t > 0.0 {
+                    positive
+                } else {
+                    negative.max(1e-30)
+                }
+            })
+            .collect()
+    };
+    let blur = taps(|_| 1.0);
+    let strength = |derivative: Vec<f32>| -> Vec<f32> {
+        let x = separable(grey, width, &derivative, &blur, Edge::Replicate);
+        let y = separable(grey, width, &blur, &derivative, Edge::Replicate);
+        x.iter().zip(y).map(|(x, y)| x.hypot(y)).collect()
+    };
+    let (edges, points) = (strength(taps(|x| -x)), strength(taps(|x| x * x - 1.0)));
+    edges.into_iter().zip(points).map(|(e, p)| [e, p]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn constant(value: f32) -> Vec<f32> {
+        vec![value; 3 * 30 * 40]
+    }
+
+    #[test]
+    fn an_image_does_not_differ_from_itself_and_black_from_white_by_nearly_all() {
+        let (black, white) = (constant(0.0), constant(1.0));
+        let image = |hdr| Image::new(hdr, 30, 40).expect("finite");
+        let (black, white) = (image(&black), image(&white));
+        assert_eq!(flip(&white, &white), 0.0);
+        // 100^0.7 = 25.1 of 41.3, above the knee of 0.4: 0.95 + (25.1 - 16.5) / 24.8 * 0.05 = 0.967.
+        let found = flip(&black, &white);
+        assert!((found - 0.967).abs() < 0.002, "{found}");
+        assert!((flip(&white, &black) - found).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_point_is_seen_more_than_its_colour_alone() {
+        let flat = constant(0.5);
+        let mut point = flat.clone();
+        for c in 0..3 {
+            point[c * 1200 + 15 * 40 + 20] = 1.0;
+        }
+        let appearance = |hdr: &[f32]| {
+            let display: Vec<f64> = hdr.iter().map(|x| f64::from(*x)).collect();
+            Appearance::new(&display, 40)
+        };
+        let (a, b) = (appearance(&flat), appearance(&point));
+        let centre = 15 * 40 + 20;
+        let [flat, point] = [a.features[centre][1], b.features[centre][1]];
+        assert!(flat < 1e-4 && point > 0.01, "{flat} {point}");
+        assert!(b.features[0][1] < 1e-4, "far from it nothing is");
+    }
+}

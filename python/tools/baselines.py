@@ -1,0 +1,107 @@
+"""Other denoisers' images of a data set, for `demc-infer evaluate --baseline NAME=DIR` and `demc-infer report`.
+
+    pip install numpy OpenEXR pyoidn scikit-image PyWavelets
+    python python/tools/baselines.py oidn --data data/sample -o oidn/
+    python python/tools/baselines.py nlm --data data/sample -o nlm/
+
+`oidn` is Intel's Open Image Denoise, given what it asks for: HDR colour, the albedo of the first hit, normals (both noisy,
+so without its `cleanAux`). `nlm` is non-local means of scikit-image on log(1 + 16 x), which knows of no features; its
+strength is the noise that scikit-image estimates in each image.
+
+One EXR file with R, G, B a scene, named as the scene's file. Files that are there are replaced.
+"""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+
+LOG_SCALE = 16
+"""What radiance is multiplied by before log(1 + x): noise in the dark and in the light gets about the same size."""
+
+
+def oidn(image: "Scene") -> np.ndarray:
+    import pyoidn
+
+    return pyoidn.denoise(image.rgb(""), albedo=image.rgb("albedo1."), normal=image.rgb("normal.", "XYZ"), hdr=True)
+
+
+def nlm(image: "Scene") -> np.ndarray:
+    from skimage.restoration import denoise_nl_means, estimate_sigma
+
+    log = np.log1p(LOG_SCALE * image.rgb("").clip(0))
+    sigma = float(estimate_sigma(log, average_sigmas=True, channel_axis=-1))
+    clean = denoise_nl_means(
+        log, patch_size=5, patch_distance=7, h=0.8 * sigma, sigma=sigma, fast_mode=True, channel_axis=-1
+    )
+    return np.expm1(clean) / LOG_SCALE
+
+
+DENOISERS: dict[str, Callable[["Scene"], np.ndarray]] = {"oidn": oidn, "nlm": nlm}
+
+
+class Scene:
+    """An EXR file's channels."""
+
+    def __init__(self, path: Path) -> None:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            self.channels = {name: channel.pixels for name, channel in file.channels().items()}
+        self.path = path
+
+    def rgb(self, prefix: str, names: str = "RGB") -> np.ndarray:
+        """Three channels as float32 [H, W, 3]."""
+        wanted = [prefix + name for name in names]
+        missing = [name for name in wanted if name not in self.channels]
+        if missing:
+            raise ValueError(f"{self.path}: no channel {', '.join(missing)}")
+        return np.ascontiguousarray(np.stack([self.channels[name] for name in wanted], -1), np.float32)
+
+
+def scenes(data: Path, split: str) -> list[Path]:
+    """The files of a split, as the manifest lists them."""
+    manifest = json.loads((data / "manifest.json").read_text())
+    found = [data / scene["file"] for scene in manifest["scenes"] if scene["split"] == split]
+    if not found:
+        raise ValueError(f"{data / 'manifest.json'}: no scenes in split {split}")
+    return found
+
+
+def write(path: Path, rgb: np.ndarray) -> None:
+    """R, G, B as half, whole or not at all."""
+    half = np.finfo(np.float16)
+    rgb = rgb.clip(half.min, half.max).astype(np.float16)
+    channels = {name: np.ascontiguousarray(rgb[..., i]) for i, name in enumerate("RGB")}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    unfinished = path.with_name(f".{path.stem}.unfinished.exr")
+    OpenEXR.File(header, channels).write(str(unfinished))
+    os.replace(unfinished, path)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("denoiser", choices=DENOISERS)
+    parser.add_argument("--data", type=Path, required=True, help="the directory with manifest.json")
+    parser.add_argument("--split", choices=["train", "test"], default="test")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="directory of the images, made if needed")
+    arguments = parser.parse_args()
+    try:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+        for path in scenes(arguments.data, arguments.split):
+            clean = DENOISERS[arguments.denoiser](Scene(path))
+            bad = int((~np.isfinite(clean)).sum())
+            if bad:
+                raise ValueError(f"{path}: {arguments.denoiser} gave {bad} NaN or infinite values")
+            write(arguments.output / f"{path.stem}.exr", clean)
+    except (OSError, ValueError, RuntimeError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
