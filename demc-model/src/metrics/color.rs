@@ -108,7 +108,7 @@ mod tests {
         for rgb in [[0.2, 0.5, 0.9], [1.0, 0.0, 0.0], [0.01, 0.02, 0.005]] {
             let back = linear_from_opponent(opponent_from_linear(rgb));
             for (a, b) in rgb.into_iter().zip(back) {
-                // The published inverse has seven digits.
+                // The inverse is rounded to seven digits.
                 assert!((a - b).abs() < 2e-5, "{rgb:?} {back:?}");
             }
         }
