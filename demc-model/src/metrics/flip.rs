@@ -1,8 +1,8 @@
 //! LDR-FLIP: "FLIP: A Difference Evaluator for Alternating Images", Andersson et al., HPG 2020.
 //!
 //! Both images are filtered by what an eye resolves at 67 pixels a degree, compared by colour, and the difference is
-//! raised where edges or points appear or vanish. Written here because the crate that wraps NVIDIA's C++ takes 8 bits a
-//! channel, needs a C++ compiler, and had its last release in 2023; the tests compare with NVIDIA's own Python package.
+//! raised where edges or points appear or vanish. Written here because the crate that wraps NVIDIA's C++ (`nv-flip` 0.1.2)
+//! takes 8 bits a channel and makes every build need a C++17 compiler; the tests compare with NVIDIA's own Python package.
 
 use std::f32::consts::PI;
 

@@ -2,7 +2,7 @@
 
 use super::{Image, LOSS_EPSILON};
 
-/// Pixels at each edge that `relmse@sbmc` leaves out: half of SBMC's 43-pixel receptive field, as its evaluation does.
+/// Pixels at each edge that `relmse@sbmc` leaves out, as SBMC's evaluation does.
 const SBMC_BORDER: usize = 21;
 /// One pixel in so many is left out of `relmse-trimmed`.
 const TRIMMED: usize = 1000;
