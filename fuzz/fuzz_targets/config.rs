@@ -9,7 +9,10 @@ use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|text: &str| {
     let (text, set) = text.split_once('\0').unwrap_or((text, ""));
-    let sets: Vec<String> = (!set.is_empty()).then(|| set.to_owned()).into_iter().collect();
+    let sets: Vec<String> = (!set.is_empty())
+        .then(|| set.to_owned())
+        .into_iter()
+        .collect();
     match Config::parse(Path::new("run.toml"), text, &sets) {
         Ok(config) => {
             // What is saved with a run resumes it.

@@ -10,7 +10,10 @@ fuzz_target!(|text: &str| {
         Ok(layout) => {
             // It travels in a bundle's header.
             let json = serde_json::to_string(&layout).expect("plain data");
-            assert_eq!(serde_json::from_str::<ChannelLayout>(&json).expect("its own"), layout);
+            assert_eq!(
+                serde_json::from_str::<ChannelLayout>(&json).expect("its own"),
+                layout
+            );
         }
         Err(error) => check_message(&error, "layout.toml"),
     }

@@ -13,7 +13,11 @@ use libfuzzer_sys::fuzz_target;
 /// In memory where there is such a directory: a file is written for every input.
 static DIR: LazyLock<PathBuf> = LazyLock::new(|| {
     let memory = Path::new("/dev/shm");
-    let parent = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };
+    let parent = if memory.is_dir() {
+        memory.to_owned()
+    } else {
+        std::env::temp_dir()
+    };
     let dir = parent.join(format!("demc-fuzz-{}", std::process::id()));
     std::fs::create_dir_all(&dir).expect("a writable directory");
     dir
