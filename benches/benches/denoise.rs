@@ -1,0 +1,163 @@
+//! What tiles cost, and what share of denoising a file is reading and writing it.
+//!
+//! ```sh
+//! cargo bench -p demc-bench --bench denoise                        # width 32, the sample's classroom
+//! cargo bench -p demc-bench --bench denoise -- 16 my-render.exr    # another width, another file
+//! ```
+//!
+//! Tiles: 1280x720 pixels in memory, repeated from the file, whole and cut as a limit of memory cuts it, in turns. Files: read, denoised and
+//! written with all their channels, each part timed, in turns.
+
+use std::path::{Path, PathBuf};
+
+use demc_bench::case;
+use demc_bench::stopwatch::{Spread, Turns, interleaved};
+use demc_data::Frame;
+use demc_data::exr::rewrite::{WriteOptions, write_denoised};
+use demc_data::frame::read_input;
+use demc_infer::{Bundle, Tiling};
+
+/// That of the binaries.
+#[global_allocator]
+static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
+
+const ROUNDS: usize = 7;
+const WIDTH: usize = 1280;
+const HEIGHT: usize = 720;
+
+fn main() -> anyhow::Result<()> {
+    demc_model::ops::within_pool(run)
+}
+
+fn run() -> anyhow::Result<()> {
+    let words: Vec<String> = std::env::args().skip(1).collect();
+    let width = words
+        .iter()
+        .find_map(|word| word.parse().ok())
+        .unwrap_or(32);
+    let file = words.iter().find(|word| word.ends_with(".exr"));
+    let sample =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../data/sample/test/col-classroom-1.exr");
+    let file = file.map_or(sample, PathBuf::from);
+    let bundle = case::network(width);
+    let frame = read_input(&file, &bundle.meta.layout)?;
+    tiles(&bundle, &repeated(&frame))?;
+    files(&bundle, &file)
+}
+
+/// Whole, in the tiles of half the memory, and in those with a smaller halo.
+fn tiles(bundle: &Bundle, frame: &Frame) -> anyhow::Result<()> {
+    let whole = bundle.pass_bytes(HEIGHT.next_multiple_of(32), WIDTH);
+    let of = |memory: u64, halo: usize| Tiling {
+        halo,
+        side: None,
+        memory: Some(memory),
+    };
+    let exact = Tiling::default().halo;
+    let cuts = [
+        of(whole, exact),
+        of(whole * 3 / 4, exact),
+        of(whole / 2, exact),
+    ];
+    let run = |tiling: &Tiling| {
+        let denoised = bundle.denoise_tiled(frame, tiling, |_, _| ());
+        std::hint::black_box(denoised.expect("it fits"));
+    };
+    let turns = interleaved(
+        ROUNDS,
+        [&mut || run(&cuts[0]), &mut || run(&cuts[1]), &mut || {
+            run(&cuts[2])
+        }],
+    );
+    println!("| {WIDTH}x{HEIGHT} | tiles | memory of a pass, MiB | pixels | s | times the whole |");
+    println!("|---|---:|---:|---:|---:|---:|");
+    for (cut, times) in cuts.iter().zip(&turns) {
+        let plan = bundle.tiles(HEIGHT, WIDTH, cut)?;
+        let (tall, wide) = plan.largest();
+        let ratio = times.ratio(&turns[0]);
+        println!(
+            "| {} | {} | {} | {:.2} | {:.2} | {:.2} ({:.2}-{:.2}) |",
+            if plan.count() == 1 {
+                "whole"
+            } else {
+                "tiles of less memory"
+            },
+            plan.count(),
+            bundle.pass_bytes(tall, wide) >> 20,
+            plan.computed_pixels() as f64 / plan.image_pixels() as f64,
+            times.spread().median,
+            ratio.median,
+            ratio.min,
+            ratio.max
+        );
+    }
+    Ok(())
+}
+
+/// Each part of what `demc-infer denoise` does with a file.
+fn files(bundle: &Bundle, file: &Path) -> anyhow::Result<()> {
+    let layout = &bundle.meta.layout;
+    let frame = read_input(file, layout)?;
+    let image = bundle.denoise(&frame)?;
+    let directory = tempfile::tempdir()?;
+    let output = directory.path().join("out.exr");
+    let [read, denoise, write] = interleaved(
+        ROUNDS,
+        [
+            &mut || {
+                std::hint::black_box(read_input(file, layout).expect("it was read before"));
+            },
+            &mut || {
+                std::hint::black_box(bundle.denoise(&frame).expect("it was denoised before"));
+            },
+            &mut || {
+                let options = WriteOptions::default();
+                let written = write_denoised(file, layout, &image, &output, &options);
+                std::hint::black_box(written.expect("a temporary file"));
+            },
+        ],
+    );
+    let percent = |part: &Turns| {
+        let Spread { min, median, max } = part.ratio(&denoise);
+        format!(
+            "{:.1} ({:.1}-{:.1})",
+            100.0 * median,
+            100.0 * min,
+            100.0 * max
+        )
+    };
+    println!(
+        "\n{}x{}, all {} channels: reading takes {} % of the network's time, writing {} %.",
+        frame.width,
+        frame.height,
+        demc_data::exr::ExrFile::open(file)?.channels().len(),
+        percent(&read),
+        percent(&write)
+    );
+    Ok(())
+}
+
+/// The image beside and below itself until it has the size.
+fn repeated(frame: &Frame) -> Frame {
+    let planes = |planes: &[f32]| -> Vec<f32> {
+        planes
+            .chunks_exact(frame.width * frame.height)
+            .flat_map(|plane| {
+                (0..WIDTH * HEIGHT).map(|i| {
+                    let (y, x) = (i / WIDTH % frame.height, i % WIDTH % frame.width);
+                    plane[y * frame.width + x]
+                })
+            })
+            .collect()
+    };
+    Frame {
+        name: "repeated".into(),
+        width: WIDTH,
+        height: HEIGHT,
+        color: planes(&frame.color),
+        features: planes(&frame.features),
+        reference: None,
+        mask: None,
+        clamped: 0,
+    }
+}
