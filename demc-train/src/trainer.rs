@@ -4,6 +4,7 @@ use burn::module::Module;
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_data::{Batch, FEATURES, Patch};
+use demc_model::loss::{dissimilarity, gamma_from_hdr};
 use demc_model::{Denoiser, ModelConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -194,10 +195,19 @@ impl Trainer {
         let ref_hdr = tensor(&batch.reference_hdr, 3);
         let out_gamma = self.model().forward(color_gamma, features_z);
         let TrainConfig {
-            loss, loss_epsilon, ..
+            loss,
+            loss_epsilon,
+            ssim,
+            ..
         } = self.config;
         let ops = self.model().ops();
-        loss.per_image(ops, out_gamma, ref_hdr, self.gamma, loss_epsilon)
+        if ssim == 0.0 {
+            return loss.per_image(ops, out_gamma, ref_hdr, self.gamma, loss_epsilon);
+        }
+        let ref_gamma = gamma_from_hdr(ref_hdr.clone(), self.gamma);
+        let unlike = dissimilarity(out_gamma.clone(), ref_gamma);
+        let relative = loss.per_image(ops, out_gamma, ref_hdr, self.gamma, loss_epsilon);
+        relative + unlike.mul_scalar(ssim)
     }
 }
 

@@ -136,14 +136,13 @@ impl Config {
             let positive = value.is_finite() && value > 0.0;
             require(positive, key, &value, "a positive number");
         }
-        let clip = train.grad_clip;
-        let clips = clip.is_finite() && clip >= 0.0;
-        require(
-            clips,
-            "train.grad_clip",
-            &clip,
-            "0 (off) or a positive number",
-        );
+        for (key, value) in [
+            ("train.grad_clip", train.grad_clip),
+            ("train.ssim", train.ssim),
+        ] {
+            let holds = value.is_finite() && value >= 0.0;
+            require(holds, key, &value, "0 (off) or a positive number");
+        }
         require(
             (0.0..1.0).contains(&train.ema),
             "train.ema",

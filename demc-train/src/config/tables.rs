@@ -46,6 +46,8 @@ pub struct TrainConfig {
     pub loss: Loss,
     /// Epsilon of the loss (Eq. 5).
     pub loss_epsilon: f32,
+    /// How many times `(1 - SSIM) / 2` is added to the loss ([`demc_model::loss::dissimilarity`]); 0: not at all, as in the paper.
+    pub ssim: f32,
     /// Batches whose gradients are averaged in one step: a step sees `data.batch_size * grad_accumulation` patches.
     pub grad_accumulation: usize,
     /// Largest norm of the whole gradient; a longer one is shortened to it. 0: no limit, as in the paper.
@@ -71,6 +73,7 @@ impl Default for TrainConfig {
             adam_epsilon: ADAM_EPSILON,
             loss: Loss::default(),
             loss_epsilon: demc_model::metrics::LOSS_EPSILON,
+            ssim: 0.0,
             grad_accumulation: 1,
             grad_clip: 0.0,
             ema: 0.0,
