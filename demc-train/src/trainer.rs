@@ -321,6 +321,21 @@ mod tests {
         }
     }
 
+    /// By no more than the weight: a dissimilarity is at most 1.
+    #[test]
+    fn the_structural_term_adds_to_the_loss_and_moves_the_weights() {
+        let mut weighed = config(2, 1);
+        weighed.train.ssim = 3.0;
+        let (mut plain, mut structural) = (trainer(&config(2, 1)), trainer(&weighed));
+        let loss = |trainer: &mut Trainer| {
+            let Ok(step) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
+            step.loss
+        };
+        let added = loss(&mut structural) - loss(&mut plain);
+        assert!(added > 0.01 && added < 3.0, "{added}");
+        assert!(structural.model().weights() != plain.model().weights());
+    }
+
     #[test]
     fn every_patch_reports_its_loss() {
         let step = trainer(&config(2, 2)).step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));

@@ -346,6 +346,17 @@ mod tests {
         }
     }
 
+    /// ablation.toml is a list of variants, which are tested as such.
+    #[test]
+    fn every_configuration_that_comes_along_is_valid() {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs");
+        for name in ["demc", "demc-nosn", "semc", "quickstart", "renders"] {
+            let path = Path::new(folder).join(name).with_extension("toml");
+            let problems = Config::load(&path, &[]).map(|config| config.validate());
+            assert_eq!(problems.unwrap(), [""; 0], "{name}");
+        }
+    }
+
     #[test]
     fn resolved_configuration_is_one_itself() {
         let mut config = Config::default();
