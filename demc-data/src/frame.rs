@@ -4,6 +4,8 @@
 use std::io::{Read, Seek};
 use std::path::Path;
 
+use rayon::prelude::*;
+
 use crate::Error;
 use crate::channel::Window;
 use crate::exr::ExrFile;
@@ -302,6 +304,13 @@ fn slots(names: &Triple) -> Vec<Option<&str>> {
     names.iter().map(|name| Some(name.as_str())).collect()
 }
 
-fn planar<'a>(planes: impl IntoIterator<Item = &'a Plane>) -> Vec<f32> {
-    planes.into_iter().flat_map(Plane::to_f32).collect()
+/// Planes of one size, one after another.
+fn planar(planes: &[Plane]) -> Vec<f32> {
+    let pixels = planes.first().map_or(0, Plane::len);
+    let mut samples = vec![0.0; planes.len() * pixels];
+    let parts = samples.par_chunks_exact_mut(pixels.max(1));
+    parts
+        .zip(planes)
+        .for_each(|(part, plane)| plane.copy_to(0, part));
+    samples
 }

@@ -66,12 +66,11 @@ impl Plane {
 
     /// The first NaN or infinite sample (index and value) and how many there are, or `None`.
     pub fn non_finite(&self) -> Option<(usize, f32, usize)> {
-        let bad: (Option<(usize, f32)>, usize) = match self {
-            Plane::Half(samples) => count_bad(samples.iter().map(|s| (s.is_finite(), s.to_f32()))),
-            Plane::Float(samples) => count_bad(samples.iter().map(|s| (s.is_finite(), *s))),
-            Plane::Uint(_) => (None, 0),
-        };
-        bad.0.map(|(index, value)| (index, value, bad.1))
+        match self {
+            Plane::Half(samples) => bad(samples, f16::is_finite, f16::to_f32),
+            Plane::Float(samples) => bad(samples, f32::is_finite, f32::from),
+            Plane::Uint(_) => None,
+        }
     }
 
     /// Sets negative samples to 0 and returns how many there were (-0 is not negative).
@@ -84,16 +83,18 @@ impl Plane {
     }
 }
 
-fn count_bad(samples: impl Iterator<Item = (bool, f32)>) -> (Option<(usize, f32)>, usize) {
-    let mut first = None;
-    let mut count = 0;
-    for (index, (finite, value)) in samples.enumerate() {
-        if !finite {
-            first = first.or(Some((index, value)));
-            count += 1;
-        }
+/// Counts first: most planes have none, and that is the faster question.
+fn bad<T: Copy>(
+    samples: &[T],
+    finite: impl Fn(T) -> bool,
+    value: impl Fn(T) -> f32,
+) -> Option<(usize, f32, usize)> {
+    let count = samples.iter().filter(|sample| !finite(**sample)).count();
+    if count == 0 {
+        return None;
     }
-    (first, count)
+    let index = samples.iter().position(|sample| !finite(*sample))?;
+    Some((index, value(samples[index]), count))
 }
 
 fn clamp<T: PartialOrd + Copy>(samples: &mut [T], zero: T) -> usize {

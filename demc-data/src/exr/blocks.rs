@@ -8,12 +8,17 @@ use ::exr::block::chunk::{
     Chunk, CompressedBlock, CompressedScanLineBlock, CompressedTileBlock, TileCoordinates,
 };
 use ::exr::error::Error as ExrError;
+use ::exr::meta::attribute::ChannelList;
 use ::exr::meta::header::Header;
 use ::exr::meta::{BlockDescription, MetaData, compute_block_count};
 use ::exr::prelude::{Compression, Vec2};
+use rayon::prelude::*;
 
 use super::{MAX_PIXELS, MAX_SIDE};
 
+/// Blocks that are decoded or coded at once, in bytes of pixels, but at least one for each processor (ours: what stays in
+/// a cache).
+const BATCH_BYTES: usize = 4 << 20;
 /// A DWA block starts with this many 64-bit numbers: sizes, a version and a method.
 const DWA_SIZES: usize = 11;
 /// Largest size accepted there, in bytes: 256 lines of the widest image with a dozen channels and more.
@@ -38,6 +43,14 @@ pub(super) struct Grid {
     pub(super) block: Vec2<usize>,
     /// Offsets of all blocks of the part; those of smaller levels come last.
     offsets: Vec<u64>,
+}
+
+impl Grid {
+    /// Column and row of the block that holds this pixel.
+    pub(super) fn place(&self, pixel: Vec2<usize>) -> (usize, usize) {
+        let Vec2(column, row) = pixel / self.block;
+        (column, row)
+    }
 }
 
 impl<R: Read + Seek> Source<R> {
@@ -81,21 +94,20 @@ impl<R: Read + Seek> Source<R> {
         })
     }
 
-    /// Decodes the block in this place of the full-size image.
+    /// Reads the block in this place, `(column, row)`, of the full-size image, still compressed.
     pub(super) fn block(
         &mut self,
         part: usize,
         grid: &Grid,
         (column, row): (usize, usize),
-    ) -> Result<UncompressedBlock, ExrError> {
+    ) -> Result<Chunk, ExrError> {
         let place = TileCoordinates {
             tile_index: Vec2(column, row),
             level_index: Vec2(0, 0),
         };
         let offset = grid.offsets.get(row * grid.columns + column).copied();
         let offset = offset.ok_or_else(|| invalid("it has too few blocks".to_owned()))?;
-        let chunk = self.chunk(part, offset, place)?;
-        self.decompress(chunk)
+        self.chunk(part, offset, place)
     }
 
     /// Where the blocks of a part are, in the order of the format: levels, then rows, then columns.
@@ -172,38 +184,72 @@ impl<R: Read + Seek> Source<R> {
             },
         })
     }
+}
 
-    /// Decompresses a block. Decoders allocate for all the pixels that it should have, and for the sizes at the start
-    /// of a DWA block whatever they are: both are checked first.
-    fn decompress(&self, chunk: Chunk) -> Result<UncompressedBlock, ExrError> {
-        let header = &self.meta.headers[chunk.layer_index];
-        let place = header.get_block_data_indices(&chunk.compressed_block)?;
-        let pixels = header
-            .get_absolute_block_pixel_coordinates(place)?
-            .size
-            .area();
-        if let CompressedBlock::ScanLine(CompressedScanLineBlock {
-            compressed_pixels_le: bytes,
-            ..
-        })
-        | CompressedBlock::Tile(CompressedTileBlock {
-            compressed_pixels_le: bytes,
-            ..
-        }) = &chunk.compressed_block
-        {
-            check_density(header, pixels, bytes.len() as u64)?;
-            if let Compression::DWAA(_) | Compression::DWAB(_) = header.compression {
-                let sizes = bytes.as_chunks().0.iter().take(DWA_SIZES);
-                let mut sizes = sizes.map(|&bytes| u64::from_le_bytes(bytes));
-                if sizes.any(|size| size > MAX_DWA_BYTES) {
-                    return Err(invalid(
-                        "the sizes in a DWA block are impossible".to_owned(),
-                    ));
-                }
+/// How many blocks of so many bytes are decoded or coded at once.
+pub(super) fn batch(block_bytes: usize) -> usize {
+    (BATCH_BYTES / block_bytes.max(1)).max(rayon::current_num_threads())
+}
+
+/// Decompresses blocks on all processors.
+pub(super) fn decompress(
+    meta: &MetaData,
+    chunks: Vec<Chunk>,
+) -> Result<Vec<UncompressedBlock>, ExrError> {
+    let chunks = chunks.into_par_iter();
+    chunks.map(|chunk| decompress_one(meta, chunk)).collect()
+}
+
+/// Decompresses a block. Decoders allocate for all the pixels that it should have, and for the sizes at the start
+/// of a DWA block whatever they are: both are checked first.
+fn decompress_one(meta: &MetaData, chunk: Chunk) -> Result<UncompressedBlock, ExrError> {
+    let header = &meta.headers[chunk.layer_index];
+    let place = header.get_block_data_indices(&chunk.compressed_block)?;
+    let pixels = header
+        .get_absolute_block_pixel_coordinates(place)?
+        .size
+        .area();
+    if let CompressedBlock::ScanLine(CompressedScanLineBlock {
+        compressed_pixels_le: bytes,
+        ..
+    })
+    | CompressedBlock::Tile(CompressedTileBlock {
+        compressed_pixels_le: bytes,
+        ..
+    }) = &chunk.compressed_block
+    {
+        check_density(header, pixels, bytes.len() as u64)?;
+        if let Compression::DWAA(_) | Compression::DWAB(_) = header.compression {
+            let sizes = bytes.as_chunks().0.iter().take(DWA_SIZES);
+            let mut sizes = sizes.map(|&bytes| u64::from_le_bytes(bytes));
+            if sizes.any(|size| size > MAX_DWA_BYTES) {
+                return Err(invalid(
+                    "the sizes in a DWA block are impossible".to_owned(),
+                ));
             }
         }
-        UncompressedBlock::decompress_chunk(chunk, &self.meta, false)
     }
+    UncompressedBlock::decompress_chunk(chunk, meta, false)
+}
+
+/// The bytes of a channel's line in a block; `y` counts from the top of the image.
+///
+/// # Panics
+/// If the block does not hold the line, or its part not the channel.
+pub(super) fn line<'a>(
+    block: &'a UncompressedBlock,
+    list: &ChannelList,
+    channel: usize,
+    y: usize,
+) -> &'a [u8] {
+    let width = block.index.pixel_size.width();
+    let (before, channel) = list
+        .channels_with_byte_offset()
+        .nth(channel)
+        .expect("a channel of the part");
+    let row = y - block.index.pixel_position.y();
+    let start = (row * list.bytes_per_pixel + before) * width;
+    &block.data[start..start + width * channel.sample_type.bytes_per_sample()]
 }
 
 pub(super) fn invalid(detail: String) -> ExrError {

@@ -22,6 +22,7 @@ mod read;
 mod recode;
 pub mod rewrite;
 mod write;
+mod zip;
 
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind};

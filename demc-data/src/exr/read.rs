@@ -2,16 +2,17 @@
 
 use std::fs::{self, File};
 use std::io::{self, BufReader, Read, Seek};
-use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use ::exr::block::lines::LineRef;
+use ::exr::block::UncompressedBlock;
 use ::exr::error::Error as ExrError;
-use ::exr::meta::attribute::{SampleType, Text};
+use ::exr::meta::attribute::{ChannelList, SampleType, Text};
 use ::exr::meta::header::Header;
+use ::exr::prelude::Vec2;
 use half::f16;
+use rayon::prelude::*;
 
-use super::blocks::{Source, invalid};
+use super::blocks::{Source, batch, decompress, invalid, line};
 use super::guarded;
 use crate::Error;
 use crate::channel::{Channel, Kind, Window, full_name};
@@ -149,7 +150,7 @@ pub(super) fn printable(name: &Text) -> String {
     name.replace(char::is_control, "\u{fffd}")
 }
 
-/// Decodes every full-size block of the parts that hold a wanted channel, on this thread.
+/// Decodes every full-size block of the parts that hold a wanted channel, on all processors.
 fn decode<R: Read + Seek>(
     source: &mut Source<R>,
     wanted: &[Channel],
@@ -168,33 +169,47 @@ fn decode<R: Read + Seek>(
         for (channel, plane) in &mut here {
             reserve(plane, channel.window)?;
         }
-        for row in 0..grid.rows {
-            for (channel, plane) in &mut here {
-                let bottom = channel.window.height.min((row + 1) * grid.block.height());
-                grow(plane, bottom * channel.window.width);
-            }
-            for column in 0..grid.columns {
-                let block = source.block(part, &grid, (column, row))?;
-                for line in block.lines(&source.meta.headers[part].channels) {
-                    for (channel, plane) in &mut here {
-                        if channel.index == line.location.channel {
-                            copy_line(line, channel.window.width, plane)?;
-                        }
-                    }
-                }
-            }
+        let list = &source.meta.headers[part].channels;
+        let rows = batch(grid.block.area() * list.bytes_per_pixel).div_ceil(grid.columns);
+        for top in (0..grid.rows).step_by(rows) {
+            let bottom = grid.rows.min(top + rows);
+            let places = (top..bottom).flat_map(|row| (0..grid.columns).map(move |x| (x, row)));
+            let chunks = places
+                .map(|place| source.block(part, &grid, place))
+                .collect::<Result<_, _>>()?;
+            let blocks = decompress(&source.meta, chunks)?;
+            let list = &source.meta.headers[part].channels;
+            here.par_iter_mut().for_each(|(channel, plane)| {
+                let Window { width, height, .. } = channel.window;
+                grow(plane, width * height.min(bottom * grid.block.height()));
+                blocks
+                    .iter()
+                    .for_each(|block| copy(block, list, channel, plane));
+            });
         }
     }
     Ok(planes)
 }
 
-fn copy_line(line: LineRef<'_>, width: usize, plane: &mut Plane) -> Result<(), ExrError> {
-    let start = line.location.position.1 * width + line.location.position.0;
-    let range: Range<usize> = start..start + line.location.sample_count;
-    match plane {
-        Plane::Half(samples) => line.read_samples_into_slice(&mut samples[range]),
-        Plane::Float(samples) => line.read_samples_into_slice(&mut samples[range]),
-        Plane::Uint(samples) => line.read_samples_into_slice(&mut samples[range]),
+/// Copies a channel's samples in a block to where they belong.
+fn copy(block: &UncompressedBlock, list: &ChannelList, channel: &Channel, plane: &mut Plane) {
+    let (Vec2(left, top), Vec2(width, height)) =
+        (block.index.pixel_position, block.index.pixel_size);
+    for y in top..top + height {
+        let start = y * channel.window.width + left;
+        let samples = start..start + width;
+        let bytes = line(block, list, channel.index, y);
+        match plane {
+            Plane::Half(plane) => put(bytes, &mut plane[samples], f16::from_ne_bytes),
+            Plane::Float(plane) => put(bytes, &mut plane[samples], f32::from_ne_bytes),
+            Plane::Uint(plane) => put(bytes, &mut plane[samples], u32::from_ne_bytes),
+        }
+    }
+}
+
+fn put<T, const N: usize>(bytes: &[u8], samples: &mut [T], from: impl Fn([u8; N]) -> T) {
+    for (sample, &bytes) in samples.iter_mut().zip(bytes.as_chunks().0) {
+        *sample = from(bytes);
     }
 }
 

@@ -1,27 +1,27 @@
 //! From the blocks of a file to those of its rewritten self, a few at a time.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::{Read, Seek, Write};
 use std::path::Path;
-use std::thread;
 
-use ::exr::block::chunk::Chunk;
+use ::exr::block::UncompressedBlock;
+use ::exr::block::chunk::{
+    Chunk, CompressedBlock, CompressedScanLineBlock, CompressedTileBlock, TileCoordinates,
+};
 use ::exr::block::writer::{ChunkWriter, ChunksWriter};
-use ::exr::block::{BlockIndex, UncompressedBlock};
 use ::exr::error::{Error as ExrError, UnitResult};
-use ::exr::meta::Headers;
-use ::exr::meta::attribute::SampleType;
-use ::exr::prelude::Vec2;
+use ::exr::meta::attribute::{ChannelList, SampleType};
+use ::exr::meta::header::Header;
+use ::exr::meta::{BlockDescription, Headers};
+use ::exr::prelude::{Compression, Vec2};
 use half::f16;
+use rayon::prelude::*;
 
-use super::blocks::{Grid, Source};
+use super::blocks::{Grid, Source, batch, decompress, line};
 use super::plan::{Origin, Plan};
 use super::write::{io_error, saturated_half};
-use super::{ExrFile, attributes, guarded};
+use super::{ExrFile, attributes, guarded, zip};
 use crate::{Error, file};
-
-/// Blocks that are compressed at once, in bytes, but for one that is larger by itself (ours: enough work for many
-/// processors, little beside the 400 MB of an 8K colour).
-const BATCH_BYTES: usize = 64 << 20;
 
 /// Writes what was planned; returns how many samples of the colour are beyond half's range.
 ///
@@ -121,94 +121,158 @@ impl<R: Read + Seek> Recoder<'_, R> {
         origins: &[Origin],
         blocks: &mut ChunkWriter<W>,
     ) -> UnitResult {
-        let headers = self.headers;
-        let header = &headers[part];
-        let grid = self.input.get(|source| source.grid(from))?;
-        let mut carried = Carried::new(from, grid, origins);
-        let (mut batch, mut bytes) = (Vec::new(), 0);
-        for (index, tile) in header.enumerate_ordered_blocks() {
-            let area = header.get_absolute_block_pixel_coordinates(tile.location)?;
-            let corner = area.position.to_usize("block position")?;
-            let mut data = Vec::with_capacity(area.size.area() * header.channels.bytes_per_pixel);
-            for y in corner.y()..corner.y() + area.size.height() {
-                carried.seek(&mut self.input, Vec2(corner.x(), y))?;
-                for (channel, origin) in header.channels.list.iter().zip(origins) {
-                    match origin.plane {
-                        Some(plane) => {
-                            let start = (plane * header.layer_size.height() + y)
-                                * header.layer_size.width()
-                                + corner.x();
-                            let line = &self.color_hdr[start..start + area.size.width()];
-                            self.clamped += put(line, channel.sample_type, &mut data);
-                        }
-                        None => {
-                            data.extend_from_slice(carried.line(self.input.source, origin.index, y))
-                        }
-                    }
-                }
+        let header = &self.headers[part];
+        let carries = origins.iter().any(|origin| origin.plane.is_none());
+        let mut carried = Carried {
+            part: from,
+            grid: self.input.get(|source| source.grid(from))?,
+            blocks: BTreeMap::new(),
+        };
+        let block_bytes = header.max_block_pixel_size().area() * header.channels.bytes_per_pixel;
+        for batch in targets(header)?.chunks(batch(block_bytes)) {
+            if carries {
+                carried.fetch(&mut self.input, batch)?;
             }
-            bytes += data.len();
-            let block = BlockIndex {
-                layer: part,
-                pixel_position: corner,
-                pixel_size: area.size,
-                level: Vec2(0, 0),
+            let list = &self.input.source.meta.headers[from].channels;
+            let code = |target: &Target| -> Result<(usize, Chunk, usize), ExrError> {
+                let (data, clamped) =
+                    assemble(header, target, origins, self.color_hdr, &carried, list);
+                let chunk = compress(part, header, target, data)?;
+                Ok((target.index, chunk, clamped))
             };
-            batch.push((index, UncompressedBlock { index: block, data }));
-            if bytes >= BATCH_BYTES {
-                compress(std::mem::take(&mut batch), headers, blocks)?;
-                bytes = 0;
+            let coded: Vec<_> = batch
+                .par_iter()
+                .map(code)
+                .collect::<Result<_, ExrError>>()?;
+            for (index, chunk, clamped) in coded {
+                blocks.write_chunk(index, chunk)?;
+                self.clamped += clamped;
             }
-        }
-        compress(batch, headers, blocks)
-    }
-}
-
-/// The channels that come from the input: the block of it that was decoded last.
-struct Carried {
-    part: usize,
-    grid: Grid,
-    /// Whether there are any.
-    any: bool,
-    /// The block's place in the grid, and the block.
-    held: Option<((usize, usize), UncompressedBlock)>,
-}
-
-impl Carried {
-    fn new(part: usize, grid: Grid, origins: &[Origin]) -> Self {
-        Self {
-            part,
-            grid,
-            any: origins.iter().any(|origin| origin.plane.is_none()),
-            held: None,
-        }
-    }
-
-    /// Decodes the block that holds this pixel, unless it is the one at hand.
-    fn seek<R: Read + Seek>(&mut self, input: &mut Input<'_, R>, pixel: Vec2<usize>) -> UnitResult {
-        let Vec2(column, row) = pixel / self.grid.block;
-        let place = (column, row);
-        if self.any && self.held.as_ref().is_none_or(|(held, _)| *held != place) {
-            // First, so that there is one at a time.
-            self.held = None;
-            let block = input.get(|source| source.block(self.part, &self.grid, place))?;
-            self.held = Some((place, block));
         }
         Ok(())
     }
+}
 
-    /// The bytes of a channel's line in the block at hand.
-    fn line<R>(&self, source: &Source<R>, channel: usize, y: usize) -> &[u8] {
-        let (_, block) = self.held.as_ref().expect("sought before");
-        let list = &source.meta.headers[self.part].channels;
-        let width = block.index.pixel_size.width();
-        let (before, channel) = list
-            .channels_with_byte_offset()
-            .nth(channel)
-            .expect("the plan has the file's channels");
-        let row = y - block.index.pixel_position.y();
-        let start = (row * list.bytes_per_pixel + before) * width;
-        &block.data[start..start + width * channel.sample_type.bytes_per_sample()]
+/// A block of the output.
+struct Target {
+    /// Its place in the table of blocks.
+    index: usize,
+    tile: TileCoordinates,
+    /// Its pixels.
+    corner: Vec2<usize>,
+    size: Vec2<usize>,
+}
+
+/// The blocks of a part, in the order of the file.
+fn targets(header: &Header) -> Result<Vec<Target>, ExrError> {
+    let blocks = header.enumerate_ordered_blocks();
+    let targets = blocks.map(|(index, tile)| {
+        let area = header.get_absolute_block_pixel_coordinates(tile.location)?;
+        Ok(Target {
+            index,
+            tile: tile.location,
+            corner: area.position.to_usize("block position")?,
+            size: area.size,
+        })
+    });
+    targets.collect()
+}
+
+/// The samples of a block of the output, and how many of the colour are beyond half's range.
+fn assemble(
+    header: &Header,
+    target: &Target,
+    origins: &[Origin],
+    color_hdr: &[f32],
+    carried: &Carried,
+    list: &ChannelList,
+) -> (Vec<u8>, usize) {
+    let Vec2(image_width, image_height) = header.layer_size;
+    let (Vec2(x, top), Vec2(width, height)) = (target.corner, target.size);
+    let mut data = Vec::with_capacity(target.size.area() * header.channels.bytes_per_pixel);
+    let mut clamped = 0;
+    for y in top..top + height {
+        for (channel, origin) in header.channels.list.iter().zip(origins) {
+            match origin.plane {
+                Some(plane) => {
+                    let start = (plane * image_height + y) * image_width + x;
+                    let line = &color_hdr[start..start + width];
+                    clamped += put(line, channel.sample_type, &mut data);
+                }
+                None => {
+                    let block = &carried.blocks[&carried.grid.place(Vec2(x, y))];
+                    data.extend_from_slice(line(block, list, origin.index, y));
+                }
+            }
+        }
+    }
+    (data, clamped)
+}
+
+/// Compresses a block of the output.
+fn compress(
+    part: usize,
+    header: &Header,
+    target: &Target,
+    data: Vec<u8>,
+) -> Result<Chunk, ExrError> {
+    let pixels = header.get_absolute_block_pixel_coordinates(target.tile)?;
+    // The format's byte order is this machine's, but for a few.
+    let ours = cfg!(target_endian = "little");
+    let compressed_pixels_le = match header.compression {
+        Compression::ZIP1 | Compression::ZIP16 if ours => zip::compress(data)?,
+        other => other.compress_image_section_to_le(header, data, pixels)?,
+    };
+    Ok(Chunk {
+        layer_index: part,
+        compressed_block: match header.blocks {
+            BlockDescription::ScanLines => CompressedBlock::ScanLine(CompressedScanLineBlock {
+                y_coordinate: pixels.position.y() + header.own_attributes.layer_position.y(),
+                compressed_pixels_le,
+            }),
+            BlockDescription::Tiles(_) => CompressedBlock::Tile(CompressedTileBlock {
+                coordinates: target.tile,
+                compressed_pixels_le,
+            }),
+        },
+    })
+}
+
+/// The channels that come from the input: those of its blocks that the batch at hand needs.
+struct Carried {
+    part: usize,
+    grid: Grid,
+    /// By column and row.
+    blocks: BTreeMap<(usize, usize), UncompressedBlock>,
+}
+
+impl Carried {
+    /// Decodes the blocks that hold pixels of these targets, but for those at hand.
+    fn fetch<R: Read + Seek>(
+        &mut self,
+        input: &mut Input<'_, R>,
+        targets: &[Target],
+    ) -> UnitResult {
+        let places = targets.iter().flat_map(|target| {
+            let (column, first) = self.grid.place(target.corner);
+            let (_, last) = self.grid.place(target.corner + target.size - Vec2(1, 1));
+            (first..=last).map(move |row| (column, row))
+        });
+        let places: BTreeSet<(usize, usize)> = places.collect();
+        self.blocks.retain(|place, _| places.contains(place));
+        let missing: Vec<(usize, usize)> = places
+            .into_iter()
+            .filter(|place| !self.blocks.contains_key(place))
+            .collect();
+        let decoded = input.get(|source| {
+            let chunks = missing
+                .iter()
+                .map(|&place| source.block(self.part, &self.grid, place))
+                .collect::<Result<_, _>>()?;
+            decompress(&source.meta, chunks)
+        })?;
+        self.blocks.extend(missing.into_iter().zip(decoded));
+        Ok(())
     }
 }
 
@@ -226,37 +290,4 @@ fn put(line: &[f32], kind: SampleType, data: &mut Vec<u8>) -> usize {
             0
         }
     }
-}
-
-/// Compresses blocks on all processors and writes them in their order.
-fn compress<W: Write + Seek>(
-    mut batch: Vec<(usize, UncompressedBlock)>,
-    headers: &Headers,
-    blocks: &mut ChunkWriter<W>,
-) -> UnitResult {
-    let threads = thread::available_parallelism().map_or(1, usize::from);
-    let share = batch.len().div_ceil(threads).max(1);
-    thread::scope(|scope| {
-        let mut workers = Vec::with_capacity(threads);
-        while !batch.is_empty() {
-            let rest = batch.split_off(share.min(batch.len()));
-            let mine = std::mem::replace(&mut batch, rest);
-            let work = move || -> Result<Vec<(usize, Chunk)>, ExrError> {
-                let chunks = mine.into_iter().map(|(index, block)| {
-                    block.compress_to_chunk(headers).map(|chunk| (index, chunk))
-                });
-                chunks.collect()
-            };
-            workers.push(thread::Builder::new().spawn_scoped(scope, work)?);
-        }
-        for worker in workers {
-            let chunks = worker
-                .join()
-                .unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
-            for (index, chunk) in chunks {
-                blocks.write_chunk(index, chunk)?;
-            }
-        }
-        Ok(())
-    })
 }
