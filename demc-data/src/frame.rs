@@ -62,7 +62,7 @@ pub struct Frame {
 /// [`Error::Read`] and [`Error::Exr`] for a file that cannot be decoded, [`Error::MissingChannels`],
 /// [`Error::Sizes`] and [`Error::NonFinite`] for buffers that cannot be used.
 pub fn read_frame(path: &Path, layout: &ChannelLayout) -> Result<Frame, Error> {
-    read(path, layout, Presence::IfThere)
+    decode(&mut ExrFile::open(path)?, layout, Presence::IfThere)
 }
 
 /// The same without the reference: what denoising needs.
@@ -70,12 +70,28 @@ pub fn read_frame(path: &Path, layout: &ChannelLayout) -> Result<Frame, Error> {
 /// # Errors
 /// As [`read_frame`].
 pub fn read_input(path: &Path, layout: &ChannelLayout) -> Result<Frame, Error> {
-    read(path, layout, Presence::Skip)
+    decode_input(&mut ExrFile::open(path)?, layout)
 }
 
-fn read(path: &Path, layout: &ChannelLayout, reference: Presence) -> Result<Frame, Error> {
-    let planes = FramePlanes::read(path, layout, reference, Presence::IfThere)?;
-    let name = path
+/// The same of a file that is open already.
+///
+/// # Errors
+/// As [`read_frame`].
+pub fn decode_input<R: Read + Seek>(
+    file: &mut ExrFile<R>,
+    layout: &ChannelLayout,
+) -> Result<Frame, Error> {
+    decode(file, layout, Presence::Skip)
+}
+
+fn decode<R: Read + Seek>(
+    file: &mut ExrFile<R>,
+    layout: &ChannelLayout,
+    reference: Presence,
+) -> Result<Frame, Error> {
+    let planes = FramePlanes::decode(file, layout, reference, Presence::IfThere)?;
+    let name = file
+        .path()
         .file_stem()
         .unwrap_or_default()
         .to_string_lossy()
@@ -133,7 +149,7 @@ impl FramePlanes {
         reference: Presence,
         mask: Presence,
     ) -> Result<Self, Error> {
-        Self::decode(ExrFile::open(path)?, layout, reference, mask)
+        Self::decode(&mut ExrFile::open(path)?, layout, reference, mask)
     }
 
     /// Decodes and checks an image that is open already.
@@ -141,14 +157,14 @@ impl FramePlanes {
     /// # Errors
     /// As [`read_frame`].
     pub fn decode<R: Read + Seek>(
-        file: ExrFile<R>,
+        file: &mut ExrFile<R>,
         layout: &ChannelLayout,
         reference: Presence,
         mask: Presence,
     ) -> Result<Self, Error> {
         let path = &file.path().to_owned();
-        let plan = Plan::new(&file, layout, reference, mask)?;
-        let window = plan.window(path, &file)?;
+        let plan = Plan::new(file, layout, reference, mask)?;
+        let window = plan.window(path, file)?;
         let names = plan.names();
         let mut decoded = names
             .iter()

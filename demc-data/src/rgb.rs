@@ -24,7 +24,7 @@ pub struct Rgb {
 /// [`Error::Read`] and [`Error::Exr`] for a file that cannot be decoded, [`Error::MissingChannels`] without such
 /// channels or with those of several layers, [`Error::Sizes`] and [`Error::NonFinite`] for channels that cannot be used.
 pub fn read_rgb(path: &Path) -> Result<Rgb, Error> {
-    let file = ExrFile::open(path)?;
+    let mut file = ExrFile::open(path)?;
     let prefix = prefix(&file);
     let names = ["R", "G", "B"].map(|channel| format!("{prefix}{channel}"));
     let names = names.each_ref().map(String::as_str);

@@ -22,7 +22,7 @@ const SIZE: (usize, usize) = (37, 21);
 /// What a file with these bytes is refused with, without its name.
 fn refusal(bytes: &[u8]) -> String {
     let path = Path::new("x.exr");
-    let read = ExrFile::parse(path, Cursor::new(bytes)).and_then(|file| {
+    let read = ExrFile::parse(path, Cursor::new(bytes)).and_then(|mut file| {
         let channels = file.channels().to_vec();
         let names: Vec<&str> = channels.iter().map(|c| c.name.as_str()).collect();
         file.read(&names)
@@ -88,7 +88,7 @@ fn of_an_image_with_smaller_levels_the_full_size_is_read() {
                 rounding,
             );
             let bytes = bytes_of(vec![part]);
-            let file = ExrFile::parse(Path::new("x.exr"), Cursor::new(bytes)).expect("sound");
+            let mut file = ExrFile::parse(Path::new("x.exr"), Cursor::new(bytes)).expect("sound");
             let planes = file.read(&["B", "G", "R"]).expect("sound");
             for (channel, plane) in planes.iter().enumerate() {
                 let places = (0..SIZE.0 * SIZE.1).map(|i| (i % SIZE.0, i / SIZE.0));
@@ -113,7 +113,7 @@ fn a_window_may_begin_anywhere() {
                 part = tiled(part, LevelMode::Singular, RoundingMode::Down);
             }
             let bytes = bytes_of(vec![placed(part, corner, display)]);
-            let file = ExrFile::parse(Path::new("x.exr"), Cursor::new(bytes)).expect("sound");
+            let mut file = ExrFile::parse(Path::new("x.exr"), Cursor::new(bytes)).expect("sound");
             let expected = Window {
                 x: corner.0,
                 y: corner.1,

@@ -64,7 +64,7 @@ fn half_float_and_uint_keep_their_precision() {
     ]);
     write(&path, SIZE, channels);
     let planes = ExrFile::open(&path)
-        .and_then(|file| file.read(&["u", "h", "f"]))
+        .and_then(|mut file| file.read(&["u", "h", "f"]))
         .expect("sound");
     assert_eq!(planes[0], Plane::Uint(uint));
     assert_eq!(

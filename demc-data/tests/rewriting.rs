@@ -2,11 +2,14 @@
 
 mod support;
 
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::BufReader;
 use std::path::Path;
 
-use demc_data::{Change, Compression, WriteOptions, Written, write_denoised};
+use demc_data::exr::ExrFile;
+use demc_data::{
+    Change, Compression, WriteOptions, Written, frame, rewrite as rewriting, write_denoised,
+};
 use exr::math::RoundingMode;
 use exr::meta::attribute::LevelMode;
 use exr::prelude::{Compression as Method, LineOrder, SampleType};
@@ -48,6 +51,37 @@ fn every_compression_and_block_shape_is_carried_over() {
                     assert_eq!(before, after, "{what}");
                     assert_eq!(written, Written::default(), "{what}");
                 }
+            }
+        }
+    }
+}
+
+#[test]
+fn what_was_kept_while_reading_is_written_as_if_it_was_read_again() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let (input, output) = (dir.path().join("in.exr"), dir.path().join("out.exr"));
+    let (layout, color) = (layout(), color(PIXELS));
+    let parts = [
+        header(None, SIZE, scene_kinds(), Method::ZIP16),
+        tiled(
+            header(None, SIZE, scene_kinds(), Method::ZIP16),
+            LevelMode::Singular,
+            RoundingMode::Down,
+        ),
+    ];
+    for part in parts {
+        write_file(&input, vec![part]);
+        rewrite(&input, &output, &WriteOptions::default());
+        let expected = fs::read(&output).expect("just written");
+        // None, a few of the blocks, all.
+        for room in [0, 40_000, usize::MAX] {
+            let mut file = ExrFile::open(&input).expect("sound").keeping(room);
+            // Twice from one file, which is read again.
+            for _ in 0..2 {
+                frame::decode_input(&mut file, &layout).expect("sound");
+                let options = WriteOptions::default();
+                rewriting::rewrite(&mut file, &layout, &color, &output, &options).expect("sound");
+                assert!(fs::read(&output).expect("written") == expected, "{room}");
             }
         }
     }

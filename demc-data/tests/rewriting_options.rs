@@ -94,7 +94,7 @@ fn the_chosen_precision_wins_and_what_half_cannot_hold_is_counted() {
         let written = write_denoised(&input, &layout(), &bright, &output, &options);
         let half = after == SampleType::F16;
         assert_eq!(written.expect("sound").clamped, if half { 3 } else { 0 });
-        let read = ExrFile::open(&output).and_then(|file| file.read(&["R", "G", "B"]));
+        let read = ExrFile::open(&output).and_then(|mut file| file.read(&["R", "G", "B"]));
         let read: Vec<f32> = read
             .expect("sound")
             .iter()

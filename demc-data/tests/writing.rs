@@ -17,7 +17,7 @@ fn written_images_read_back_as_r_g_b() {
     let rgb: Vec<f32> = (0..3 * PIXELS).map(|i| i as f32 * 0.37).collect();
     write_rgb(&path, SIZE.0, SIZE.1, &rgb, Precision::Float).expect("writable");
     let read = |path: &Path| -> Vec<f32> {
-        let file = ExrFile::open(path).expect("just written");
+        let mut file = ExrFile::open(path).expect("just written");
         assert_eq!(
             file.channels()
                 .iter()

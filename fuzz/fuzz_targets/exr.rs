@@ -36,7 +36,7 @@ fuzz_target!(init: allow_caught_panics(), |bytes: &[u8]| {
     }
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
     let file = open().expect("it opened before");
-    match FramePlanes::decode(file, &layout, Presence::IfThere, Presence::IfThere) {
+    match FramePlanes::decode(&mut file, &layout, Presence::IfThere, Presence::IfThere) {
         Ok(planes) => assert_eq!((planes.color.len(), planes.features.len()), (3, 12)),
         Err(error) => check_message(&error, NAME),
     }

@@ -43,7 +43,7 @@ fuzz_target!(init: allow_caught_panics(), |bytes: &[u8]| {
     std::fs::write(&input, bytes).expect("writable");
     let color = vec![0.5; 3 * pixels];
     if write_denoised(&input, &layout, &color, &output, &WriteOptions::default()).is_ok() {
-        let written = ExrFile::open(&output).expect("what was written is readable");
+        let mut written = ExrFile::open(&output).expect("what was written is readable");
         assert_eq!(names(written.channels()), expected);
         let planes = written.read(&["R", "G", "B"]).expect("what was written is readable");
         assert!(planes.iter().all(|plane| plane.to_f32().iter().all(|&sample| sample == 0.5)));

@@ -65,7 +65,7 @@ pub fn run(files: &[PathBuf], json: bool) -> Result<ExitCode> {
 }
 
 fn rows(path: &Path) -> Result<Vec<Row>> {
-    let file = ExrFile::open(path)?;
+    let mut file = ExrFile::open(path)?;
     let channels = file.channels().to_vec();
     let names: Vec<&str> = channels
         .iter()

@@ -1,6 +1,7 @@
 //! Blocks of pixels by their place in the image. The file is not trusted: what it says is held against its length
 //! before memory is allocated for it.
 
+use std::collections::HashMap;
 use std::io::{Read, Seek, SeekFrom};
 
 use ::exr::block::UncompressedBlock;
@@ -18,7 +19,7 @@ use super::{MAX_PIXELS, MAX_SIDE};
 
 /// Blocks that are decoded or coded at once, in bytes of pixels, but at least one for each processor (ours: what stays in
 /// a cache).
-const BATCH_BYTES: usize = 4 << 20;
+const BATCH_BYTES: usize = 8 << 20;
 /// A DWA block starts with this many 64-bit numbers: sizes, a version and a method.
 const DWA_SIZES: usize = 11;
 /// Largest size accepted there, in bytes: 256 lines of the widest image with a dozen channels and more.
@@ -34,6 +35,24 @@ pub(super) struct Source<R> {
     blocks: u64,
     /// Bytes in the file.
     length: u64,
+    kept: Kept,
+}
+
+/// Decoded blocks that will be asked for again.
+#[derive(Default)]
+struct Kept {
+    /// By part and place.
+    blocks: HashMap<(usize, Place), UncompressedBlock>,
+    /// Bytes for which there is room.
+    room: usize,
+}
+
+/// Column and row of a block.
+pub(super) type Place = (usize, usize);
+
+enum Block {
+    Compressed(Chunk),
+    Decoded(UncompressedBlock),
 }
 
 /// The blocks of a part in its full size, in rows from the top; a block of scan lines is as wide as the image.
@@ -46,8 +65,8 @@ pub(super) struct Grid {
 }
 
 impl Grid {
-    /// Column and row of the block that holds this pixel.
-    pub(super) fn place(&self, pixel: Vec2<usize>) -> (usize, usize) {
+    /// The block that holds this pixel.
+    pub(super) fn place(&self, pixel: Vec2<usize>) -> Place {
         let Vec2(column, row) = pixel / self.block;
         (column, row)
     }
@@ -76,7 +95,30 @@ impl<R: Read + Seek> Source<R> {
             tables,
             blocks,
             length,
+            kept: Kept::default(),
         })
+    }
+
+    /// Makes room for decoded blocks.
+    pub(super) fn make_room(&mut self, bytes: usize) {
+        self.kept.room = bytes;
+    }
+
+    /// Keeps decoded blocks, as many as there is room for.
+    pub(super) fn keep(&mut self, part: usize, places: &[Place], blocks: Vec<UncompressedBlock>) {
+        for (place, block) in places.iter().zip(blocks) {
+            if let Some(room) = self.kept.room.checked_sub(block.data.len()) {
+                self.kept.room = room;
+                self.kept.blocks.insert((part, *place), block);
+            }
+        }
+    }
+
+    /// Takes a block out of those that were kept.
+    fn take(&mut self, part: usize, place: Place) -> Option<UncompressedBlock> {
+        let block = self.kept.blocks.remove(&(part, place))?;
+        self.kept.room += block.data.len();
+        Some(block)
     }
 
     /// The table of a part's blocks.
@@ -94,13 +136,28 @@ impl<R: Read + Seek> Source<R> {
         })
     }
 
-    /// Reads the block in this place, `(column, row)`, of the full-size image, still compressed.
-    pub(super) fn block(
+    /// Decodes blocks of the full-size image on all processors, but for those that were kept.
+    pub(super) fn decode(
         &mut self,
         part: usize,
         grid: &Grid,
-        (column, row): (usize, usize),
-    ) -> Result<Chunk, ExrError> {
+        places: &[Place],
+    ) -> Result<Vec<UncompressedBlock>, ExrError> {
+        let blocks = places.iter().map(|&place| match self.take(part, place) {
+            Some(block) => Ok(Block::Decoded(block)),
+            None => self.block(part, grid, place).map(Block::Compressed),
+        });
+        let blocks: Vec<Block> = blocks.collect::<Result<_, _>>()?;
+        let meta = &self.meta;
+        let blocks = blocks.into_par_iter().map(|block| match block {
+            Block::Decoded(block) => Ok(block),
+            Block::Compressed(chunk) => decompress(meta, chunk),
+        });
+        blocks.collect()
+    }
+
+    /// Reads the block in this place of the full-size image, still compressed.
+    fn block(&mut self, part: usize, grid: &Grid, (column, row): Place) -> Result<Chunk, ExrError> {
         let place = TileCoordinates {
             tile_index: Vec2(column, row),
             level_index: Vec2(0, 0),
@@ -166,7 +223,7 @@ impl<R: Read + Seek> Source<R> {
                 "it is cut short: a block has {size} bytes, {room} are left"
             )));
         }
-        let mut compressed_pixels_le = Vec::new();
+        let mut compressed_pixels_le = Vec::with_capacity(usize::try_from(size)?);
         (&mut self.reader)
             .take(size)
             .read_to_end(&mut compressed_pixels_le)?;
@@ -188,21 +245,15 @@ impl<R: Read + Seek> Source<R> {
 
 /// How many blocks of so many bytes are decoded or coded at once.
 pub(super) fn batch(block_bytes: usize) -> usize {
-    (BATCH_BYTES / block_bytes.max(1)).max(rayon::current_num_threads())
-}
-
-/// Decompresses blocks on all processors.
-pub(super) fn decompress(
-    meta: &MetaData,
-    chunks: Vec<Chunk>,
-) -> Result<Vec<UncompressedBlock>, ExrError> {
-    let chunks = chunks.into_par_iter();
-    chunks.map(|chunk| decompress_one(meta, chunk)).collect()
+    let threads = rayon::current_num_threads();
+    (BATCH_BYTES / block_bytes.max(1))
+        .next_multiple_of(threads)
+        .max(threads)
 }
 
 /// Decompresses a block. Decoders allocate for all the pixels that it should have, and for the sizes at the start
 /// of a DWA block whatever they are: both are checked first.
-fn decompress_one(meta: &MetaData, chunk: Chunk) -> Result<UncompressedBlock, ExrError> {
+fn decompress(meta: &MetaData, chunk: Chunk) -> Result<UncompressedBlock, ExrError> {
     let header = &meta.headers[chunk.layer_index];
     let place = header.get_block_data_indices(&chunk.compressed_block)?;
     let pixels = header

@@ -12,7 +12,7 @@ use ::exr::prelude::Vec2;
 use half::f16;
 use rayon::prelude::*;
 
-use super::blocks::{Source, batch, decompress, invalid, line};
+use super::blocks::{Place, Source, batch, invalid, line};
 use super::guarded;
 use crate::Error;
 use crate::channel::{Channel, Kind, Window, full_name};
@@ -106,13 +106,20 @@ impl<R: Read + Seek> ExrFile<R> {
         })
     }
 
+    /// Keeps what [`read`](Self::read) decodes, up to so many bytes, for [`rewrite`](super::rewrite::rewrite): that part
+    /// of the file is then decompressed once, not twice.
+    pub fn keeping(mut self, bytes: usize) -> Self {
+        self.source.make_room(bytes);
+        self
+    }
+
     /// Decodes the named channels, in the order of `names`; other parts and smaller resolution levels are
     /// not touched.
     ///
     /// # Errors
     /// [`Error::MissingChannels`] if the file lacks any; [`Error::Exr`] if the pixel data is cut short or
     /// damaged, or there is no memory for it.
-    pub fn read(mut self, names: &[&str]) -> Result<Vec<Plane>, Error> {
+    pub fn read(&mut self, names: &[&str]) -> Result<Vec<Plane>, Error> {
         self.require(names)?;
         let wanted: Vec<Channel> = names
             .iter()
@@ -173,11 +180,9 @@ fn decode<R: Read + Seek>(
         let rows = batch(grid.block.area() * list.bytes_per_pixel).div_ceil(grid.columns);
         for top in (0..grid.rows).step_by(rows) {
             let bottom = grid.rows.min(top + rows);
-            let places = (top..bottom).flat_map(|row| (0..grid.columns).map(move |x| (x, row)));
-            let chunks = places
-                .map(|place| source.block(part, &grid, place))
-                .collect::<Result<_, _>>()?;
-            let blocks = decompress(&source.meta, chunks)?;
+            let row = |row| (0..grid.columns).map(move |column| (column, row));
+            let places: Vec<Place> = (top..bottom).flat_map(row).collect();
+            let blocks = source.decode(part, &grid, &places)?;
             let list = &source.meta.headers[part].channels;
             here.par_iter_mut().for_each(|(channel, plane)| {
                 let Window { width, height, .. } = channel.window;
@@ -186,6 +191,7 @@ fn decode<R: Read + Seek>(
                     .iter()
                     .for_each(|block| copy(block, list, channel, plane));
             });
+            source.keep(part, &places, blocks);
         }
     }
     Ok(planes)

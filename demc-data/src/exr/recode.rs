@@ -17,7 +17,7 @@ use ::exr::prelude::{Compression, Vec2};
 use half::f16;
 use rayon::prelude::*;
 
-use super::blocks::{Grid, Source, batch, decompress, line};
+use super::blocks::{Grid, Place, Source, batch, line};
 use super::plan::{Origin, Plan};
 use super::write::{io_error, saturated_half};
 use super::{ExrFile, attributes, guarded, zip};
@@ -242,8 +242,7 @@ fn compress(
 struct Carried {
     part: usize,
     grid: Grid,
-    /// By column and row.
-    blocks: BTreeMap<(usize, usize), UncompressedBlock>,
+    blocks: BTreeMap<Place, UncompressedBlock>,
 }
 
 impl Carried {
@@ -258,19 +257,13 @@ impl Carried {
             let (_, last) = self.grid.place(target.corner + target.size - Vec2(1, 1));
             (first..=last).map(move |row| (column, row))
         });
-        let places: BTreeSet<(usize, usize)> = places.collect();
+        let places: BTreeSet<Place> = places.collect();
         self.blocks.retain(|place, _| places.contains(place));
-        let missing: Vec<(usize, usize)> = places
+        let missing: Vec<Place> = places
             .into_iter()
             .filter(|place| !self.blocks.contains_key(place))
             .collect();
-        let decoded = input.get(|source| {
-            let chunks = missing
-                .iter()
-                .map(|&place| source.block(self.part, &self.grid, place))
-                .collect::<Result<_, _>>()?;
-            decompress(&source.meta, chunks)
-        })?;
+        let decoded = input.get(|source| source.decode(self.part, &self.grid, &missing))?;
         self.blocks.extend(missing.into_iter().zip(decoded));
         Ok(())
     }

@@ -7,6 +7,7 @@
 //! whatever the size of the image.
 
 use std::fmt;
+use std::io::{Read, Seek};
 use std::path::Path;
 
 use super::plan::Plan;
@@ -97,16 +98,10 @@ impl fmt::Display for Change {
     }
 }
 
-/// Writes `input` again with the denoised colour in place of the channels that `layout` calls its colour, whole or not
-/// at all.
-///
-/// # Shapes
-/// `color_hdr` is `[3, height, width]` of the colour's window, linear radiance.
+/// [`rewrite`] of the file at `input`.
 ///
 /// # Errors
-/// [`Error::Read`], [`Error::Exr`] and [`Error::MissingChannels`] for the input, as [`crate::read_frame`];
-/// [`Error::Sizes`] if its colour channels do not cover the same pixels, [`Error::Exr`] if these are not as many as
-/// `color_hdr` has; [`Error::Write`] for the output.
+/// As [`crate::read_frame`], and as [`rewrite`].
 pub fn write_denoised(
     input: &Path,
     layout: &ChannelLayout,
@@ -114,9 +109,34 @@ pub fn write_denoised(
     output: &Path,
     options: &WriteOptions,
 ) -> Result<Written, Error> {
-    let mut file = ExrFile::open(input)?;
-    let plan = Plan::new(&file, layout, color_hdr.len(), options)?;
-    let clamped = recode(&mut file, &plan, color_hdr, output)?;
+    rewrite(
+        &mut ExrFile::open(input)?,
+        layout,
+        color_hdr,
+        output,
+        options,
+    )
+}
+
+/// Writes a file again with the denoised colour in place of the channels that `layout` calls its colour, whole or not
+/// at all.
+///
+/// # Shapes
+/// `color_hdr` is `[3, height, width]` of the colour's window, linear radiance.
+///
+/// # Errors
+/// [`Error::Read`], [`Error::Exr`] and [`Error::MissingChannels`] for the input, as [`ExrFile::read`];
+/// [`Error::Sizes`] if its colour channels do not cover the same pixels, [`Error::Exr`] if these are not as many as
+/// `color_hdr` has; [`Error::Write`] for the output.
+pub fn rewrite<R: Read + Seek>(
+    file: &mut ExrFile<R>,
+    layout: &ChannelLayout,
+    color_hdr: &[f32],
+    output: &Path,
+    options: &WriteOptions,
+) -> Result<Written, Error> {
+    let plan = Plan::new(file, layout, color_hdr.len(), options)?;
+    let clamped = recode(file, &plan, color_hdr, output)?;
     Ok(Written {
         clamped,
         changes: plan.changes,

@@ -32,7 +32,7 @@ pub fn headers(path: &Path) -> Vec<Header> {
 }
 
 pub fn planes(path: &Path) -> Vec<(Channel, Plane)> {
-    let file = ExrFile::open(path).unwrap_or_else(|error| panic!("{error}"));
+    let mut file = ExrFile::open(path).unwrap_or_else(|error| panic!("{error}"));
     let channels = file.channels().to_vec();
     let names: Vec<&str> = channels.iter().map(|c| c.name.as_str()).collect();
     let planes = file.read(&names).unwrap_or_else(|error| panic!("{error}"));

@@ -5,6 +5,8 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::Args;
+use demc_data::exr::ExrFile;
+use demc_data::frame::decode_input;
 use demc_infer::denoise::SeamError;
 use demc_infer::guard::EnergyBias;
 use demc_infer::{Bundle, Picture};
@@ -15,6 +17,10 @@ use super::tiling::{TilingFlags, describe};
 use super::writing::Writing;
 use super::{Clamped, DeviceFlag, Model};
 use crate::progress::Progress;
+
+/// Decoded blocks of an input that are kept until its output is written (ours: 19 half channels of 1920x1080 three times;
+/// what is beyond is decompressed twice).
+const KEPT_BYTES: usize = 256 << 20;
 
 /// Denoise OpenEXR images of any size.
 ///
@@ -112,7 +118,8 @@ impl Denoise {
     /// Returns the number of negative samples that were set to 0.
     fn image(&self, job: &Job, bundle: &Bundle, progress: &Progress) -> anyhow::Result<usize> {
         let name = job.input.display();
-        let frame = demc_data::frame::read_input(&job.input, &bundle.meta.layout)?;
+        let mut file = ExrFile::open(&job.input)?.keeping(KEPT_BYTES);
+        let frame = decode_input(&mut file, &bundle.meta.layout)?;
         for warning in bundle.warnings(&frame)? {
             progress.line(format_args!("warning: {name}: {warning}"));
         }
@@ -148,7 +155,10 @@ impl Denoise {
                 .write_png(&path)
                 .with_context(|| format!("cannot write {}", path.display()))?;
         }
-        for note in self.writing.write(job, &bundle.meta.layout, image)? {
+        for note in self
+            .writing
+            .write(&mut file, job, &bundle.meta.layout, image)?
+        {
             progress.line(format_args!("note: {name}: {note}"));
         }
         Ok(frame.clamped)

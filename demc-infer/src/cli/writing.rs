@@ -2,8 +2,8 @@
 
 use clap::{Args, ValueEnum};
 use demc_data::ChannelLayout;
-use demc_data::exr::Compression;
-use demc_data::exr::rewrite::{Keep, WriteOptions, write_denoised};
+use demc_data::exr::rewrite::{Keep, WriteOptions, rewrite};
+use demc_data::exr::{Compression, ExrFile};
 
 use super::jobs::Job;
 
@@ -31,9 +31,10 @@ enum Precision {
 }
 
 impl Writing {
-    /// Writes the job's output; returns what is not as in its input, in words.
+    /// Writes the job's output, `input` with another colour; returns what is not as in its input, in words.
     pub fn write(
         &self,
+        input: &mut ExrFile,
         job: &Job,
         layout: &ChannelLayout,
         color_hdr: &[f32],
@@ -49,7 +50,7 @@ impl Writing {
             }),
             compression: self.compression,
         };
-        let written = write_denoised(&job.input, layout, color_hdr, &job.output, &options)?;
+        let written = rewrite(input, layout, color_hdr, &job.output, &options)?;
         let mut notes: Vec<String> = written.changes.iter().map(ToString::to_string).collect();
         if written.clamped > 0 {
             let clamped = written.clamped;
