@@ -9,8 +9,9 @@ use demc_data::{Batch, FEATURES, Patch};
 
 use crate::config::Config;
 use crate::data::Data;
+use crate::initial::drawn;
 use crate::optimizer::Adam;
-use crate::trainer::{Trainer, initial_model};
+use crate::trainer::Trainer;
 
 /// A forward pass as a share of forward, backward and optimizer; ours, measured between 0.2 and 0.4.
 const FORWARD_SHARE: f64 = 0.3;
@@ -31,7 +32,7 @@ impl Estimate {
     pub fn measure(config: &Config, data: &Data, first: u64, device: &Device) -> Self {
         let mut single = config.clone();
         single.train.grad_accumulation = 1;
-        let model = initial_model(&config.model, 0, data.normalizer.flat_color, device);
+        let model = drawn(&config.model, 0, data.normalizer.flat_color, device);
         let mut trainer = Trainer::new(&single, model, Adam::new(1e-8), None, device.clone());
         let patch = grey_patch(config.data.patch_size);
         let mut time = || {

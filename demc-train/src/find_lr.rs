@@ -15,8 +15,9 @@ use demc_data::{Batch, BatchLoader, PatchSource};
 use crate::chart::{Figure, Panel, Scale, Series, with_kind};
 use crate::config::Config;
 use crate::data::Data;
+use crate::initial::initial_model;
 use crate::optimizer::Adam;
-use crate::trainer::{Trainer, initial_model};
+use crate::trainer::Trainer;
 
 /// What a smoothed ratio keeps of the one before; ours.
 const SMOOTH: f64 = 0.9;
@@ -71,7 +72,7 @@ pub struct Sweep {
 /// step.
 ///
 /// # Errors
-/// A scene that cannot be read.
+/// A scene that cannot be read; a `train.init` that does not fit.
 pub fn sweep(
     config: &Config,
     data: &Data,
@@ -88,13 +89,12 @@ pub fn sweep(
     )?;
     let mut loader = BatchLoader::new(Arc::new(source), 0);
     let device = device.clone().autodiff();
-    let trainer = || {
-        let (seed, flat) = (config.train.seed, data.normalizer.flat_color);
-        let model = initial_model(&config.model, seed, flat, &device);
+    let trainer = || -> anyhow::Result<Trainer> {
+        let model = initial_model(config, data.normalizer.flat_color, &device)?;
         let adam = Adam::new(config.train.adam_epsilon);
-        Trainer::new(config, model, adam, None, device.clone())
+        Ok(Trainer::new(config, model, adam, None, device.clone()))
     };
-    let (mut trained, untrained) = (trainer(), trainer());
+    let (mut trained, untrained) = (trainer()?, trainer()?);
     let mut found = Ratios::default();
     for step in 0..range.steps {
         let batches: Result<Vec<Batch>, demc_data::Error> = (0..config.train.grad_accumulation)

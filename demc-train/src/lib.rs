@@ -14,6 +14,7 @@ pub mod data;
 pub mod ema;
 pub mod estimate;
 pub mod find_lr;
+pub mod initial;
 pub mod metrics_log;
 pub mod optimizer;
 pub mod plot;

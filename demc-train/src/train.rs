@@ -16,12 +16,13 @@ use crate::checkpoint::{self, Best, Checkpoint, Keep, Means, State, Store};
 use crate::clock::Clock;
 use crate::config::{Config, OnNan};
 use crate::data::Data;
+use crate::initial::initial_model;
 use crate::metrics_log::Line;
 use crate::optimizer::Adam;
 use crate::recorder::{Recorder, timed};
 use crate::run_dir::{Facts, RunDir};
 use crate::signals::Signals;
-use crate::trainer::{Step, Trainer, initial_model};
+use crate::trainer::{Step, Trainer};
 use crate::validation::{self, Validation};
 use crate::watch::Setting;
 
@@ -60,7 +61,7 @@ impl Run {
     /// A new run, or the one of `checkpoint` where it stopped. `device` is plain.
     ///
     /// # Errors
-    /// Scenes smaller than a patch; a checkpoint that is not of this run.
+    /// Scenes smaller than a patch; a checkpoint that is not of this run; a `train.init` that does not fit.
     pub fn new(
         config: Config,
         data: Data,
@@ -97,12 +98,7 @@ impl Run {
                 (bundle.model, average, adam, state)
             }
             None => {
-                let model = initial_model(
-                    &config.model,
-                    config.train.seed,
-                    data.normalizer.flat_color,
-                    &device,
-                );
+                let model = initial_model(&config, data.normalizer.flat_color, &device)?;
                 let adam = Adam::new(config.train.adam_epsilon);
                 (model, None, adam, State::start())
             }

@@ -4,10 +4,8 @@ use burn::module::Module;
 use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_data::{Batch, FEATURES, Patch};
+use demc_model::Denoiser;
 use demc_model::loss::{dissimilarity, gamma_from_hdr};
-use demc_model::{Denoiser, ModelConfig};
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
 
 use crate::config::{Config, TrainConfig};
 use crate::ema::Ema;
@@ -40,16 +38,6 @@ impl Step {
     pub fn is_finite(&self) -> bool {
         self.loss.is_finite() && self.grad_norm.is_finite()
     }
-}
-
-/// The network that a run starts with: drawn from the run's seed, its grey head at the best flat image.
-pub fn initial_model(
-    model: &ModelConfig,
-    seed: u64,
-    flat_color: [f32; 3],
-    device: &Device,
-) -> Denoiser {
-    model.init(&mut ChaCha8Rng::seed_from_u64(seed), flat_color, device)
 }
 
 impl Trainer {
@@ -213,8 +201,12 @@ impl Trainer {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use std::convert::Infallible;
+
+    use demc_model::ModelConfig;
+
+    use super::*;
+    use crate::initial::drawn;
 
     fn config(batch_size: usize, grad_accumulation: usize) -> Config {
         let mut config = Config::default();
@@ -248,7 +240,7 @@ mod tests {
 
     fn trainer(config: &Config) -> Trainer {
         let device = Device::flex().autodiff();
-        let model = initial_model(&config.model, 1, [0.3; 3], &device);
+        let model = drawn(&config.model, 1, [0.3; 3], &device);
         Trainer::new(config, model, Adam::new(1e-8), None, device)
     }
 

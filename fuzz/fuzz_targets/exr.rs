@@ -15,7 +15,7 @@ const NAME: &str = "input.exr";
 
 fuzz_target!(init: allow_caught_panics(), |bytes: &[u8]| {
     let open = || ExrFile::parse(Path::new(NAME), Cursor::new(bytes));
-    let file = match open() {
+    let mut file = match open() {
         Ok(file) => file,
         Err(error) => return check_message(&error, NAME),
     };
@@ -35,7 +35,7 @@ fuzz_target!(init: allow_caught_panics(), |bytes: &[u8]| {
         Err(error) => check_message(&error, NAME),
     }
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
-    let file = open().expect("it opened before");
+    let mut file = open().expect("it opened before");
     match FramePlanes::decode(&mut file, &layout, Presence::IfThere, Presence::IfThere) {
         Ok(planes) => assert_eq!((planes.color.len(), planes.features.len()), (3, 12)),
         Err(error) => check_message(&error, NAME),

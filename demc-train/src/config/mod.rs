@@ -110,6 +110,9 @@ impl Config {
     fn make_absolute(&mut self) -> std::io::Result<()> {
         self.data.root = std::path::absolute(&self.data.root)?;
         self.run.dir = std::path::absolute(&self.run.dir)?;
+        if !self.train.init.as_os_str().is_empty() {
+            self.train.init = std::path::absolute(&self.train.init)?;
+        }
         if self.data.layout.ends_with(".toml") {
             let layout = std::path::absolute(&self.data.layout)?;
             self.data.layout = layout.to_string_lossy().into_owned();
@@ -224,8 +227,8 @@ impl Config {
 
     /// The keys by which a run of `self` would differ from one of `other`; empty if one may continue the other.
     ///
-    /// Where the run and its data are kept (scenes, statistics and layout are compared on their own), when checkpoints are
-    /// written and which stay, what happens at a step that is not finite, and threads and memory of the loader change no
+    /// Where the run, its data and the weights that it began with are kept (scenes, statistics and layout are compared on
+    /// their own), when checkpoints are written and which stay, what happens at a step that is not finite, and threads and memory of the loader change no
     /// number of the run so far.
     pub fn differences(&self, other: &Config) -> Vec<String> {
         let essence = |config: &Config| {
@@ -237,6 +240,7 @@ impl Config {
                 ..RunConfig::default()
             };
             config.train.on_nan = OnNan::default();
+            config.train.init = PathBuf::new();
             config.data.root = PathBuf::new();
             config.data.layout = String::new();
             config.data.workers = DataConfig::default().workers;

@@ -57,6 +57,8 @@ pub struct TrainConfig {
     pub ema: f64,
     /// What happens at a loss or gradient that is not finite.
     pub on_nan: OnNan,
+    /// Weights to begin with: a run directory, a checkpoint or an exported file of the same `[model]`. Empty: drawn from `seed`.
+    pub init: PathBuf,
     /// Seed of weights, validation scenes, shuffling and augmentation.
     pub seed: u64,
 }
@@ -78,6 +80,7 @@ impl Default for TrainConfig {
             grad_clip: 0.0,
             ema: 0.0,
             on_nan: OnNan::default(),
+            init: PathBuf::new(),
             seed: 1,
         }
     }

@@ -1,0 +1,85 @@
+//! Runs that begin with the weights of another: `train.init`.
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+
+use burn::tensor::Device;
+use common::{config, error_line, stderr, train};
+use demc_infer::Bundle;
+
+/// The weights that a run is known by, in the order of their names, but for running statistics: those move whatever the
+/// learning rate.
+fn weights(run: &Path) -> Vec<(String, Vec<f32>)> {
+    let bundle = Bundle::load(run, &Device::flex()).expect("a network");
+    let weights = bundle.model.weights().into_iter();
+    let learned = weights.filter(|weight| !weight.name.contains("running"));
+    learned.map(|weight| (weight.name, weight.data)).collect()
+}
+
+/// Checks that both have the same weights, but for steps of a rate of 1e-30.
+fn assert_same(ours: &Path, theirs: &Path) {
+    for ((name, ours), (same, theirs)) in weights(ours).iter().zip(&weights(theirs)) {
+        assert_eq!(name, same);
+        let mut pairs = ours.iter().zip(theirs);
+        assert!(pairs.all(|(a, b)| (a - b).abs() < 1e-29), "{name}");
+    }
+}
+
+#[test]
+fn a_run_begins_where_another_ended() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    let at = |name: &str| dir.path().join(name);
+    let (first, second, third) = (at("first"), at("second"), at("third"));
+    let plain = ["--set", "train.ema=0"];
+    let few = [&plain[..], &["--set", "train.steps=3"]].concat();
+    let output = train(&config, &first, &few);
+    assert!(output.status.success(), "{}", stderr(&output));
+
+    // One step of a rate that rounds to none.
+    let init = format!("train.init={}", first.display());
+    let one = ["--set", "train.steps=1", "--set", "train.lr_start=1e-30"];
+    let still = [
+        &plain[..],
+        &one,
+        &["--set", "train.lr_end=1e-30", "--set", &init],
+    ]
+    .concat();
+    let output = train(&config, &second, &still);
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert_same(&first, &second);
+
+    // The other seed would draw another network; and what began needs the weights no more.
+    let seeded = [&still[..], &["--set", "train.seed=2"]].concat();
+    let output = train(&config, &third, &seeded);
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert_same(&first, &third);
+    fs::remove_dir_all(&first).expect("the test's own");
+    let output = train(&config, &third, &[&seeded[..], &["--resume"]].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+}
+
+#[test]
+fn weights_that_do_not_fit_are_refused_before_anything_is_written() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    let (first, second) = (dir.path().join("first"), dir.path().join("second"));
+    let output = train(&config, &first, &["--set", "train.steps=2"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+
+    let init = format!("train.init={}", first.display());
+    let wider = ["--set", &init, "--set", "model.width=3"];
+    let line = error_line(&train(&config, &second, &wider), 1);
+    assert!(line.contains("train.init"), "{line}");
+    assert!(line.contains("model.width = 3, there 2"), "{line}");
+
+    let nothing = ["--set", "train.init=nowhere.safetensors"];
+    let line = error_line(&train(&config, &second, &nothing), 1);
+    assert!(
+        line.contains("train.init") && line.contains("nowhere.safetensors"),
+        "{line}"
+    );
+    assert!(!second.exists());
+}
