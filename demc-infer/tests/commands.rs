@@ -2,10 +2,11 @@
 
 mod common;
 
+use std::ffi::OsString;
 use std::fs;
 use std::path::Path;
 
-use common::{demc_infer, run_directory, sample};
+use common::{Outcome, demc_infer, run_directory, sample};
 use demc_model::metrics::METRICS;
 use serde_json::Value;
 
@@ -13,20 +14,30 @@ fn json(path: &Path) -> Value {
     serde_json::from_slice(&fs::read(path).expect("file")).expect("JSON")
 }
 
+/// `demc-infer evaluate` of a model on the sample.
+fn evaluate(model: &Path, flags: &[&str]) -> Outcome {
+    let list = arguments!["evaluate", "--model", model, "--data", sample()];
+    demc_infer(list.into_iter().chain(flags.iter().map(OsString::from)))
+}
+
+/// The scores that it gives.
+fn scores(model: &Path, flags: &[&str]) -> Value {
+    let outcome = evaluate(model, &[&["--json", "-"], flags].concat()).success();
+    serde_json::from_str(&outcome.stdout).expect("only JSON")
+}
+
+/// `demc-infer export` of a model to a file.
+fn export(model: &Path, file: &Path, flags: &[&str]) -> Outcome {
+    let list = arguments!["export", "--model", model, "-o", file];
+    demc_infer(list.into_iter().chain(flags.iter().map(OsString::from)))
+}
+
 #[test]
 fn evaluate_prints_a_table_and_writes_the_same_numbers_as_json() {
     let run = run_directory();
     let file = run.path().join("scores.json");
-    let list = arguments![
-        "evaluate",
-        "--model",
-        run.path(),
-        "--data",
-        sample(),
-        "--json",
-        file
-    ];
-    let outcome = demc_infer(list).success();
+    let flags = ["--json", file.to_str().expect("UTF-8")];
+    let outcome = evaluate(run.path(), &flags).success();
     let report = json(&file);
 
     let keys = |value: &Value| {
@@ -77,17 +88,7 @@ fn evaluate_prints_a_table_and_writes_the_same_numbers_as_json() {
 #[test]
 fn the_noisy_scores_are_those_of_the_manifest() {
     let run = run_directory();
-    let list = arguments![
-        "evaluate",
-        "--model",
-        run.path(),
-        "--data",
-        sample(),
-        "--json",
-        "-"
-    ];
-    let report: Value =
-        serde_json::from_str(&demc_infer(list).success().stdout).expect("only JSON");
+    let report = scores(run.path(), &[]);
     let manifest = json(&sample().join("manifest.json"));
     for image in report["images"].as_array().expect("array") {
         let scenes = manifest["scenes"].as_array().expect("array");
@@ -123,58 +124,24 @@ fn evaluate_without_a_data_set_is_one_line() {
 #[test]
 fn an_export_gives_the_same_scores_in_either_style_of_names() {
     let run = run_directory();
-    let scores = |model: &Path| {
-        let list = arguments![
-            "evaluate",
-            "--model",
-            model,
-            "--data",
-            sample(),
-            "--json",
-            "-"
-        ];
-        demc_infer(list).success().stdout
-    };
-    let expected = scores(run.path());
     let file = run.path().join("torch.safetensors");
-    let list = arguments![
-        "export",
-        "--model",
-        run.path(),
-        "--format",
-        "safetensors",
-        "--names",
-        "torch",
-        "--precision",
-        "f32",
-        "-o",
-        file
-    ];
-    let outcome = demc_infer(list).success();
+    let format = ["--format", "safetensors"];
+    let flags = [&format[..], &["--names", "torch", "--precision", "f32"]].concat();
+    let outcome = export(run.path(), &file, &flags).success();
     assert!(
         outcome.stdout.contains("read back and compared"),
         "{}",
         outcome.stdout
     );
-    assert_eq!(scores(&file), expected);
+    assert_eq!(scores(&file, &[]), scores(run.path(), &[]));
 }
 
 #[test]
 fn an_f16_export_loads_and_is_half_the_size() {
     let run = run_directory();
-    let export = |precision: &str| {
+    let weights_of = |precision: &str| {
         let file = run.path().join(precision);
-        let model = run.path();
-        demc_infer(arguments![
-            "export",
-            "--model",
-            model,
-            "--precision",
-            precision,
-            "-o",
-            file
-        ])
-        .success();
+        export(run.path(), &file, &["--precision", precision]).success();
         demc_infer(arguments!["inspect", "--model", file]).success();
         let header = 8 + u64::from_le_bytes(
             fs::read(&file).expect("file")[..8]
@@ -183,7 +150,7 @@ fn an_f16_export_loads_and_is_half_the_size() {
         );
         fs::metadata(&file).expect("file").len() - header
     };
-    let (full, half) = (export("f32"), export("f16"));
+    let (full, half) = (weights_of("f32"), weights_of("f16"));
     assert!(
         half < full * 6 / 10,
         "{half} of {full}: all but batch normalisation is halved"
@@ -250,17 +217,8 @@ fn an_export_never_replaces_its_model() {
         (run.path(), &best),
         (&best, &roundabout),
     ] {
-        let list = arguments![
-            "export",
-            "--model",
-            model,
-            "--precision",
-            "f16",
-            "-o",
-            output
-        ];
         let start = format!("output {} would replace the model", output.display());
-        demc_infer(list).failure(2, &start);
+        export(model, output, &["--precision", "f16"]).failure(2, &start);
     }
     assert_eq!(fs::read(&best).expect("bundle"), before);
 }
@@ -268,14 +226,8 @@ fn an_export_never_replaces_its_model() {
 #[test]
 fn an_export_that_cannot_be_written_is_named() {
     let run = run_directory();
-    let list = arguments![
-        "export",
-        "--model",
-        run.path(),
-        "-o",
-        "/no-such-directory/x.safetensors"
-    ];
-    demc_infer(list).failure(
+    let file = Path::new("/no-such-directory/x.safetensors");
+    export(run.path(), file, &[]).failure(
         1,
         "cannot write /no-such-directory/x.safetensors: No such file",
     );
@@ -296,22 +248,9 @@ fn every_way_to_compute_scores_the_same() {
     use demc_model::ops::Isa;
     let run = run_directory();
     let score = |flag: &str, value: &str| -> f64 {
-        let file = run.path().join("scores.json");
-        let list = arguments![
-            "evaluate",
-            "--model",
-            run.path(),
-            "--data",
-            sample(),
-            "--json",
-            file,
-            flag,
-            value
-        ];
-        demc_infer(list).success();
-        json(&file)["mean"]["denoised"]["relmse"]
-            .as_f64()
-            .expect("number")
+        let report = scores(run.path(), &[flag, value]);
+        let relmse = &report["mean"]["denoised"]["relmse"];
+        relmse.as_f64().expect("number")
     };
     let burn = score("--ops", "burn");
     for isa in Isa::available() {
@@ -328,16 +267,7 @@ fn every_way_to_compute_scores_the_same() {
 fn operations_and_instructions_that_do_not_exist_are_usage_errors() {
     let run = run_directory();
     for (flag, listed) in [("--ops", "kernels, burn"), ("--isa", "portable")] {
-        let list = arguments![
-            "evaluate",
-            "--model",
-            run.path(),
-            "--data",
-            sample(),
-            flag,
-            "none"
-        ];
-        let outcome = demc_infer(list);
+        let outcome = evaluate(run.path(), &[flag, "none"]);
         assert_eq!(outcome.code, 2, "{}", outcome.stderr);
         assert!(outcome.stderr.contains(listed), "{}", outcome.stderr);
     }
