@@ -6,7 +6,7 @@ use std::ffi::OsString;
 use std::fs;
 use std::path::Path;
 
-use common::{Outcome, demc_infer, run_directory, sample};
+use common::{Outcome, demc_infer, export, run_directory, sample};
 use demc_model::metrics::METRICS;
 use serde_json::Value;
 
@@ -24,12 +24,6 @@ fn evaluate(model: &Path, flags: &[&str]) -> Outcome {
 fn scores(model: &Path, flags: &[&str]) -> Value {
     let outcome = evaluate(model, &[&["--json", "-"], flags].concat()).success();
     serde_json::from_str(&outcome.stdout).expect("only JSON")
-}
-
-/// `demc-infer export` of a model to a file.
-fn export(model: &Path, file: &Path, flags: &[&str]) -> Outcome {
-    let list = arguments!["export", "--model", model, "-o", file];
-    demc_infer(list.into_iter().chain(flags.iter().map(OsString::from)))
 }
 
 #[test]

@@ -6,7 +6,7 @@ mod common;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use common::{Outcome, demc_infer, random_bundle, run_directory};
+use common::{Outcome, demc_infer, export, random_bundle, run_directory};
 use demc_infer::{Names, Precision};
 
 /// A shell script that stands in for Python. Its arguments are those of `verify`: `-c SCRIPT KIND FILE FOLDER`.
@@ -24,19 +24,9 @@ fn verified(script: &str) -> (Outcome, bool) {
     let run = run_directory();
     let python = interpreter(run.path(), script);
     let file = run.path().join("x.onnx");
-    let list = arguments![
-        "export",
-        "--model",
-        run.path(),
-        "--format",
-        "onnx",
-        "--verify",
-        "--python",
-        python,
-        "-o",
-        file
-    ];
-    let outcome = demc_infer(list);
+    let python = python.to_str().expect("UTF-8");
+    let flags = ["--format", "onnx", "--verify", "--python", python];
+    let outcome = export(run.path(), &file, &flags);
     (outcome, file.exists())
 }
 
@@ -84,11 +74,7 @@ fn an_interpreter_that_is_no_help_is_one_line_that_says_what_to_do() {
 fn flags_that_do_not_go_together_are_usage_errors() {
     let run = run_directory();
     let file = run.path().join("x.onnx");
-    let export = |flags: &[&str]| {
-        let mut list = arguments!["export", "--model", run.path(), "-o", file].to_vec();
-        list.extend(flags.iter().map(Into::into));
-        demc_infer(list)
-    };
+    let export = |flags: &[&str]| export(run.path(), &file, flags);
     let names = export(&["--format", "onnx", "--names", "torch"]);
     names.failure(2, "--names is for safetensors");
     assert_eq!(export(&["--python", "python3"]).code, 2);
@@ -100,18 +86,8 @@ fn an_onnx_export_is_half_as_large_in_f16() {
     let run = run_directory();
     let size = |precision: &str| {
         let file = run.path().join(precision);
-        let list = arguments![
-            "export",
-            "--model",
-            run.path(),
-            "--format",
-            "onnx",
-            "--precision",
-            precision,
-            "-o",
-            file
-        ];
-        demc_infer(list).success();
+        let flags = ["--format", "onnx", "--precision", precision];
+        export(run.path(), &file, &flags).success();
         fs::metadata(file).expect("file").len()
     };
     // The graph itself is 15 kB in either.
@@ -125,16 +101,7 @@ fn an_import_is_what_was_exported_byte_for_byte() {
     let file = |name: &str| run.path().join(name);
     let (torch, back, again) = (file("torch"), file("back"), file("again"));
     let model = file("best.safetensors");
-    let list = arguments![
-        "export",
-        "--model",
-        run.path(),
-        "--names",
-        "torch",
-        "-o",
-        torch
-    ];
-    demc_infer(list).success();
+    export(run.path(), &torch, &["--names", "torch"]).success();
     let outcome = demc_infer(arguments!["import", torch, "-o", back]).success();
     assert!(
         outcome.stdout.contains("read back and compared"),

@@ -1,7 +1,7 @@
 //! What the command line tests share: a tiny random model, the sample data, and the real binary.
 #![allow(dead_code, reason = "each test file uses its part")]
 
-use std::ffi::OsStr;
+use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -88,6 +88,12 @@ macro_rules! arguments {
     ($($argument:expr),* $(,)?) => {
         [$(std::ffi::OsString::from(&$argument)),*]
     };
+}
+
+/// `demc-infer export` of a model to a file.
+pub fn export(model: &Path, file: &Path, flags: &[&str]) -> Outcome {
+    let list = arguments!["export", "--model", model, "-o", file];
+    demc_infer(list.into_iter().chain(flags.iter().map(OsString::from)))
 }
 
 impl Outcome {
