@@ -4,12 +4,11 @@
 use std::io::{Read, Seek};
 use std::path::Path;
 
-use rayon::prelude::*;
-
 use crate::Error;
 use crate::channel::Window;
 use crate::exr::ExrFile;
 use crate::layout::{ChannelLayout, Missing, Triple};
+use crate::parallel::{self, processors};
 use crate::plane::Plane;
 
 /// Number of feature channels: normal xyz, position xyz, texture RGB at the first and at the second vertex
@@ -324,9 +323,9 @@ fn slots(names: &Triple) -> Vec<Option<&str>> {
 fn planar(planes: &[Plane]) -> Vec<f32> {
     let pixels = planes.first().map_or(0, Plane::len);
     let mut samples = vec![0.0; planes.len() * pixels];
-    let parts = samples.par_chunks_exact_mut(pixels.max(1));
-    parts
-        .zip(planes)
-        .for_each(|(part, plane)| plane.copy_to(0, part));
+    let parts = samples.chunks_exact_mut(pixels.max(1)).zip(planes);
+    parallel::map(processors(), parts.collect(), |(part, plane)| {
+        plane.copy_to(0, part)
+    });
     samples
 }

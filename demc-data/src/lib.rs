@@ -28,6 +28,7 @@ pub mod file;
 pub mod frame;
 pub mod layout;
 pub mod loader;
+mod parallel;
 pub mod patch;
 pub mod plane;
 pub mod ranges;

@@ -2,11 +2,9 @@
 //! scenes. Sums are taken scene by scene in double precision and merged in the scenes' order: the result is
 //! the same whatever the number of threads.
 
-use std::panic::resume_unwind;
-use std::thread;
-
 use crate::dataset::size_mismatch;
 use crate::frame::{FEATURES, FramePlanes, Presence};
+use crate::parallel::{self, processors};
 use crate::plane::Plane;
 use crate::ranges::{Ranges, Summary};
 use crate::transform::STD_FLOOR;
@@ -42,8 +40,7 @@ impl Statistics {
     /// The first scene's error that cannot be used, as in [`crate::read_frame`]; a reference that `layout`
     /// names must be there, and so must the mask.
     pub fn measure(scenes: &[Scene], layout: &ChannelLayout, gamma: f32) -> Result<Self, Error> {
-        let cores = thread::available_parallelism().map_or(1, usize::from);
-        Self::measure_on(cores.min(MAX_THREADS), scenes, layout, gamma)
+        Self::measure_on(processors().min(MAX_THREADS), scenes, layout, gamma)
     }
 
     /// As [`Self::measure`], on a given number of threads.
@@ -56,26 +53,13 @@ impl Statistics {
         layout: &ChannelLayout,
         gamma: f32,
     ) -> Result<Self, Error> {
-        let threads = threads.clamp(1, scenes.len().max(1));
-        let shares: Vec<Vec<Sums>> = thread::scope(|scope| {
-            let share = |first: usize| {
-                let scenes = scenes.iter().skip(first).step_by(threads);
-                scenes.map(|scene| Sums::of(scene, layout)).collect()
-            };
-            let started: Vec<_> = (0..threads)
-                .map(|first| scope.spawn(move || share(first)))
-                .collect();
-            let joined = started
-                .into_iter()
-                .map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
-            joined.collect::<Result<_, Error>>()
-        })?;
+        let of_scene = |scene| Sums::of(scene, layout);
         let mut total = Sums::default();
         let mut summaries = Vec::with_capacity(scenes.len());
-        for index in 0..scenes.len() {
-            let share = &shares[index % threads][index / threads];
-            total.add(share);
-            summaries.extend(share.summary.clone());
+        for sums in parallel::map(threads, scenes.iter().collect(), of_scene) {
+            let sums = sums?;
+            total.add(&sums);
+            summaries.extend(sums.summary);
         }
         Ok(Self {
             normalizer: Normalizer {

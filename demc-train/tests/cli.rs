@@ -3,8 +3,11 @@
 mod common;
 
 use std::fs;
+use std::process::Stdio;
+use std::thread::sleep;
+use std::time::{Duration, Instant};
 
-use common::{config, error_line, stderr, train};
+use common::{command, config, error_line, stderr, train};
 
 #[test]
 fn a_short_run_leaves_everything_behind() {
@@ -154,4 +157,28 @@ fn bad_worlds_exit_with_1_and_one_line() {
         error_line(&output, 1).contains("file"),
         "a run directory that cannot be made"
     );
+}
+
+/// Reading and decoding need none of the threads that train, which wait for them.
+#[test]
+fn one_thread_is_enough() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let run = dir.path().join("run");
+    let mut child = command(&config(dir.path()), &run, &["--set", "train.steps=2"])
+        .env("RAYON_NUM_THREADS", "1")
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("the binary runs");
+    let started = Instant::now();
+    let status = loop {
+        if let Some(status) = child.try_wait().expect("a child") {
+            break status;
+        }
+        if started.elapsed().as_secs() > 120 {
+            child.kill().expect("a child");
+        }
+        sleep(Duration::from_millis(20));
+    };
+    assert!(status.success(), "{status}");
 }

@@ -13,9 +13,9 @@ use ::exr::meta::attribute::ChannelList;
 use ::exr::meta::header::Header;
 use ::exr::meta::{BlockDescription, MetaData, compute_block_count};
 use ::exr::prelude::{Compression, Vec2};
-use rayon::prelude::*;
 
 use super::{MAX_PIXELS, MAX_SIDE};
+use crate::parallel::{self, processors};
 
 /// Blocks that are decoded or coded at once, in bytes of pixels, but at least one for each processor (ours: what stays in
 /// a cache).
@@ -149,11 +149,11 @@ impl<R: Read + Seek> Source<R> {
         });
         let blocks: Vec<Block> = blocks.collect::<Result<_, _>>()?;
         let meta = &self.meta;
-        let blocks = blocks.into_par_iter().map(|block| match block {
+        let blocks = parallel::map(processors(), blocks, |block| match block {
             Block::Decoded(block) => Ok(block),
             Block::Compressed(chunk) => decompress(meta, chunk),
         });
-        blocks.collect()
+        blocks.into_iter().collect()
     }
 
     /// Reads the block in this place of the full-size image, still compressed.
@@ -245,7 +245,7 @@ impl<R: Read + Seek> Source<R> {
 
 /// How many blocks of so many bytes are decoded or coded at once.
 pub(super) fn batch(block_bytes: usize) -> usize {
-    let threads = rayon::current_num_threads();
+    let threads = processors();
     (BATCH_BYTES / block_bytes.max(1))
         .next_multiple_of(threads)
         .max(threads)

@@ -10,12 +10,12 @@ use ::exr::meta::attribute::{ChannelList, SampleType, Text};
 use ::exr::meta::header::Header;
 use ::exr::prelude::Vec2;
 use half::f16;
-use rayon::prelude::*;
 
 use super::blocks::{Place, Source, batch, invalid, line};
 use super::guarded;
 use crate::Error;
 use crate::channel::{Channel, Kind, Window, full_name};
+use crate::parallel::{self, processors};
 use crate::plane::Plane;
 
 /// An open file whose headers were read and checked; its pixels were not decoded yet.
@@ -184,7 +184,8 @@ fn decode<R: Read + Seek>(
             let places: Vec<Place> = (top..bottom).flat_map(row).collect();
             let blocks = source.decode(part, &grid, &places)?;
             let list = &source.meta.headers[part].channels;
-            here.par_iter_mut().for_each(|(channel, plane)| {
+            let planes = here.iter_mut().collect();
+            parallel::map(processors(), planes, |(channel, plane)| {
                 let Window { width, height, .. } = channel.window;
                 grow(plane, width * height.min(bottom * grid.block.height()));
                 blocks

@@ -15,12 +15,12 @@ use ::exr::meta::header::Header;
 use ::exr::meta::{BlockDescription, Headers};
 use ::exr::prelude::{Compression, Vec2};
 use half::f16;
-use rayon::prelude::*;
 
 use super::blocks::{Grid, Place, Source, batch, line};
 use super::plan::{Origin, Plan};
 use super::write::{io_error, saturated_half};
 use super::{ExrFile, attributes, guarded, zip};
+use crate::parallel::{self, processors};
 use crate::{Error, file};
 
 /// Writes what was planned; returns how many samples of the colour are beyond half's range.
@@ -140,11 +140,8 @@ impl<R: Read + Seek> Recoder<'_, R> {
                 let chunk = compress(part, header, target, data)?;
                 Ok((target.index, chunk, clamped))
             };
-            let coded: Vec<_> = batch
-                .par_iter()
-                .map(code)
-                .collect::<Result<_, ExrError>>()?;
-            for (index, chunk, clamped) in coded {
+            for coded in parallel::map(processors(), batch.iter().collect(), code) {
+                let (index, chunk, clamped) = coded?;
                 blocks.write_chunk(index, chunk)?;
                 self.clamped += clamped;
             }
