@@ -1,4 +1,4 @@
-//! How long a run will take, from one patch that is trained on and thrown away.
+//! How long a run will take, from a few patches that are trained on and thrown away.
 
 use std::convert::Infallible;
 use std::fmt;
@@ -16,6 +16,12 @@ use crate::trainer::Trainer;
 /// A forward pass as a share of forward, backward and optimizer; ours, measured between 0.2 and 0.4.
 const FORWARD_SHARE: f64 = 0.3;
 
+/// Patches of the larger of two batches that are timed; ours: enough to fill the kernels.
+const SEVERAL: usize = 4;
+
+/// Seconds after which a step is not timed again: what comes once, such as fetching memory, is little of it.
+const LONG: f64 = 1.0;
+
 /// A run's duration, roughly.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Estimate {
@@ -28,26 +34,38 @@ pub struct Estimate {
 }
 
 impl Estimate {
-    /// Trains a network like that of `config` on one patch, twice, and scales the faster time to the steps after `first`.
+    /// Trains a network like that of `config` on one patch and on up to four: what a patch takes and what a step does, whatever its
+    /// patches, give the time of the steps after `first`.
     pub fn measure(config: &Config, data: &Data, first: u64, device: &Device) -> Self {
         let mut single = config.clone();
         single.train.grad_accumulation = 1;
         let model = drawn(&config.model, 0, data.normalizer.flat_color, device);
         let mut trainer = Trainer::new(&single, model, Adam::new(1e-8), None, device.clone());
-        let patch = grey_patch(config.data.patch_size);
-        let mut time = || {
+        let mut once = |batch: &Batch| {
             let started = Instant::now();
-            let Ok(_) = trainer.step(0.0, || Ok::<_, Infallible>(patch.clone()));
+            let Ok(_) = trainer.step(0.0, || Ok::<_, Infallible>(batch.clone()));
             started.elapsed().as_secs_f64()
         };
-        let patch_time = f64::min(time(), time());
+        let mut time = |patches: usize| {
+            let batch = grey_batch(patches, config.data.patch_size);
+            match once(&batch) {
+                long if long > LONG => long,
+                short => short.min(once(&batch)),
+            }
+        };
+        let one = time(1);
+        // No more than a batch of the run: there may be no memory for them.
+        let patch_time = match SEVERAL.min(config.data.batch_size) {
+            1 => one,
+            several => ((time(several) - one) / (several - 1) as f64).clamp(0.1 * one, one),
+        };
         let pixels: usize = data
             .validation
             .iter()
             .map(|scene| scene.width * scene.height)
             .sum();
         let patches = pixels as f64 / (config.data.patch_size * config.data.patch_size) as f64;
-        let step = patch_time * config.patches_per_step() as f64;
+        let step = one + patch_time * (config.patches_per_step() - 1) as f64;
         let validation = patch_time * patches * FORWARD_SHARE;
         let steps = config.train.steps.saturating_sub(first) as f64;
         let left = steps * (step + validation / config.run.validate_every as f64);
@@ -59,18 +77,19 @@ impl Estimate {
     }
 }
 
-fn grey_patch(side: usize) -> Batch {
-    let planes = |channels: usize| vec![0.5; channels * side * side];
+fn grey_batch(size: usize, side: usize) -> Batch {
+    let planes = |channels: usize| vec![0.5; size * channels * side * side];
+    let patch = Patch {
+        scene: 0,
+        y: 0,
+        x: 0,
+    };
     Batch {
-        size: 1,
+        size,
         color_gamma: planes(3),
         features_z: planes(FEATURES),
         reference_hdr: planes(3),
-        patches: vec![Patch {
-            scene: 0,
-            y: 0,
-            x: 0,
-        }],
+        patches: vec![patch; size],
     }
 }
 
@@ -85,11 +104,12 @@ impl fmt::Display for Estimate {
     }
 }
 
-/// `3 days 4 h`, `2 h 5 min`, `3 min 20 s`, `4.2 s`: two units at most.
+/// `3 days 4 h`, `2 h 5 min`, `3 min 20 s`, `4.2 s`, `250 ms`: two units at most.
 fn human(duration: f64) -> String {
     let seconds = duration as u64;
     let (days, hours, minutes) = (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60);
     match (days, hours, minutes) {
+        (0, 0, 0) if duration < 1.0 => format!("{:.0} ms", 1000.0 * duration),
         (0, 0, 0) => format!("{duration:.1} s"),
         (0, 0, _) => format!("{minutes} min {} s", seconds % 60),
         (0, _, _) => format!("{hours} h {minutes} min"),
@@ -103,6 +123,7 @@ mod tests {
 
     #[test]
     fn durations_have_two_units_at_most() {
+        assert_eq!(human(0.25), "250 ms");
         assert_eq!(human(4.24), "4.2 s");
         assert_eq!(human(200.0), "3 min 20 s");
         assert_eq!(human(7500.0), "2 h 5 min");
