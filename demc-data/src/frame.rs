@@ -138,7 +138,7 @@ pub enum Presence {
 }
 
 impl FramePlanes {
-    /// Reads and checks an image.
+    /// Reads and checks an image, on this thread alone: who reads many has threads of its own.
     ///
     /// # Errors
     /// As [`read_frame`].
@@ -148,7 +148,8 @@ impl FramePlanes {
         reference: Presence,
         mask: Presence,
     ) -> Result<Self, Error> {
-        Self::decode(&mut ExrFile::open(path)?, layout, reference, mask)
+        let mut file = ExrFile::open(path)?.on_threads(1);
+        Self::decode(&mut file, layout, reference, mask)
     }
 
     /// Decodes and checks an image that is open already.

@@ -3,39 +3,47 @@
 
 use std::num::NonZero;
 use std::panic::resume_unwind;
-use std::thread;
+use std::sync::{Mutex, OnceLock, PoisonError};
+use std::thread::{self, Builder};
 
 /// How many processors there are for this process.
 pub(crate) fn processors() -> usize {
-    thread::available_parallelism().map_or(1, NonZero::get)
+    static PROCESSORS: OnceLock<usize> = OnceLock::new();
+    *PROCESSORS.get_or_init(|| thread::available_parallelism().map_or(1, NonZero::get))
 }
 
-/// What `work` makes of each item, in their order, on so many threads; with one, or for one item, on this thread.
+/// What `work` makes of each item, in their order, on so many threads, this one among them. Where the system has no more
+/// threads, those that there are do it.
 pub(crate) fn map<T: Send, U: Send>(
     threads: usize,
     items: Vec<T>,
     work: impl Fn(T) -> U + Sync,
 ) -> Vec<U> {
-    let share = items.len().div_ceil(threads.max(1)).max(1);
-    let count = items.len();
-    let mut items = items.into_iter();
-    let work = &work;
-    let mut next = || -> Vec<T> { items.by_ref().take(share).collect() };
-    let mine = next();
-    thread::scope(|scope| {
-        let others: Vec<_> = (share..count)
-            .step_by(share)
-            .map(|_| {
-                let theirs = next();
-                scope.spawn(move || theirs.into_iter().map(work).collect::<Vec<U>>())
-            })
+    if threads.min(items.len()) <= 1 {
+        return items.into_iter().map(work).collect();
+    }
+    let threads = threads.min(items.len());
+    let queue = Mutex::new(items.into_iter().enumerate());
+    let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).next();
+    let share = || {
+        let mut done = Vec::new();
+        while let Some((index, item)) = next() {
+            done.push((index, work(item)));
+        }
+        done
+    };
+    let mut done: Vec<(usize, U)> = thread::scope(|scope| {
+        let others: Vec<_> = (1..threads)
+            .map_while(|_| Builder::new().spawn_scoped(scope, share).ok())
             .collect();
-        let mut done: Vec<U> = mine.into_iter().map(work).collect();
+        let mut done = share();
         for other in others {
             done.extend(other.join().unwrap_or_else(|panic| resume_unwind(panic)));
         }
         done
-    })
+    });
+    done.sort_unstable_by_key(|(index, _)| *index);
+    done.into_iter().map(|(_, result)| result).collect()
 }
 
 #[cfg(test)]
@@ -47,7 +55,7 @@ mod tests {
     #[test]
     fn results_stand_in_the_order_of_the_items() {
         for threads in [0, 1, 2, 3, 7, 100] {
-            for count in [0, 1, 2, 3, 10] {
+            for count in [0, 1, 2, 3, 10, 1000] {
                 let tripled = map(threads, (0..count).collect(), |item| 3 * item);
                 let expected: Vec<usize> = (0..count).map(|item| 3 * item).collect();
                 assert_eq!(tripled, expected, "{threads} threads");

@@ -267,6 +267,25 @@ fn paths_of_every_spelling_lead_to_the_file() {
     assert_eq!(error, format!("cannot read {}", missing.display()));
 }
 
+/// A block is not longer than its pixels, so that blocks which lie over each other, here one in each number of the next, take
+/// no more memory than the image.
+#[test]
+fn blocks_longer_than_their_pixels_are_refused() {
+    let lines = 64;
+    let part = header(None, (1, lines), rgb_kinds(), Method::Uncompressed);
+    let mut bytes = bytes_of(vec![part]);
+    // Each line: its place, its size, three samples.
+    let first = bytes.len() - lines * (4 + 4 + 6);
+    for (line, block) in bytes[first..].chunks_exact_mut(14).enumerate() {
+        let rest = ((lines - line) * 14 - 8) as u32;
+        block[4..8].copy_from_slice(&rest.to_le_bytes());
+    }
+    assert_eq!(
+        refusal(&bytes),
+        format!("a block has {} bytes for 6 bytes of pixels", lines * 14 - 8)
+    );
+}
+
 /// A header of a large image with a full table of blocks, every entry of which leads to the same small one.
 fn bomb(size: (usize, usize), method: Method, tiles: bool) -> Vec<u8> {
     let mut part = header(None, (1, 1), rgb_kinds(), method);

@@ -11,6 +11,7 @@ use demc_data::{
     Change, Compression, WriteOptions, Written, frame, rewrite as rewriting, write_denoised,
 };
 use exr::math::RoundingMode;
+use exr::meta::BlockDescription;
 use exr::meta::attribute::LevelMode;
 use exr::prelude::{Compression as Method, LineOrder, SampleType};
 use support::files::{header, placed, rgb_kinds, scene_kinds, tiled, write_file};
@@ -56,32 +57,55 @@ fn every_compression_and_block_shape_is_carried_over() {
     }
 }
 
+/// Of an image that is several batches on one thread and one on many, in blocks of other sizes than its output's too.
 #[test]
-fn what_was_kept_while_reading_is_written_as_if_it_was_read_again() {
+fn threads_and_what_was_kept_while_reading_change_nothing() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let (input, output) = (dir.path().join("in.exr"), dir.path().join("out.exr"));
-    let (layout, color) = (layout(), color(PIXELS));
-    let parts = [
-        header(None, SIZE, scene_kinds(), Method::ZIP16),
-        tiled(
-            header(None, SIZE, scene_kinds(), Method::ZIP16),
-            LevelMode::Singular,
-            RoundingMode::Down,
-        ),
-    ];
-    for part in parts {
+    let size = (700, 400);
+    let (layout, color) = (layout(), color(size.0 * size.1));
+    let part = |method| header(None, size, scene_kinds(), method);
+    let zip = part(Method::ZIP16);
+    let upwards = zip.clone().with_encoding(
+        Method::ZIP16,
+        BlockDescription::ScanLines,
+        LineOrder::Decreasing,
+    );
+    for (part, compression) in [
+        (upwards, None),
+        (tiled(zip, LevelMode::Singular, RoundingMode::Down), None),
+        (part(Method::PIZ), Some(Compression::Zips)),
+        (part(Method::ZIP1), Some(Compression::Zip)),
+    ] {
         write_file(&input, vec![part]);
-        rewrite(&input, &output, &WriteOptions::default());
-        let expected = fs::read(&output).expect("just written");
-        // None, a few of the blocks, all.
-        for room in [0, 40_000, usize::MAX] {
-            let mut file = ExrFile::open(&input).expect("sound").keeping(room);
-            // Twice from one file, which is read again.
-            for _ in 0..2 {
-                frame::decode_input(&mut file, &layout).expect("sound");
-                let options = WriteOptions::default();
-                rewriting::rewrite(&mut file, &layout, &color, &output, &options).expect("sound");
-                assert!(fs::read(&output).expect("written") == expected, "{room}");
+        let options = WriteOptions {
+            compression,
+            ..WriteOptions::default()
+        };
+        let write = |file: &mut ExrFile| {
+            rewriting::rewrite(file, &layout, &color, &output, &options).expect("sound");
+            fs::read(&output).expect("just written")
+        };
+        let open = |threads| ExrFile::open(&input).expect("sound").on_threads(threads);
+        let (image, expected) = {
+            let mut file = open(1);
+            let image = frame::decode_input(&mut file, &layout).expect("sound");
+            (image, write(&mut file))
+        };
+        assert_carried(&input, &output, "one thread");
+        for threads in [1, 3, 100] {
+            // None, some of the blocks, all.
+            for room in [0, 5_000_000, usize::MAX] {
+                let mut file = open(threads).keeping(&layout, room);
+                // Twice from one file, which is read again.
+                for _ in 0..2 {
+                    let again = frame::decode_input(&mut file, &layout).expect("sound");
+                    assert!(again == image, "{threads} threads, room {room}");
+                    assert!(
+                        write(&mut file) == expected,
+                        "{threads} threads, room {room}"
+                    );
+                }
             }
         }
     }

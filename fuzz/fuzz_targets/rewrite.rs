@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 use demc_data::exr::ExrFile;
-use demc_data::{ChannelLayout, WriteOptions, write_denoised};
+use demc_data::frame::decode_input;
+use demc_data::rewrite::rewrite;
+use demc_data::{ChannelLayout, WriteOptions};
 use demc_fuzz::allow_caught_panics;
 use libfuzzer_sys::fuzz_target;
 
@@ -39,10 +41,12 @@ fuzz_target!(init: allow_caught_panics(), |bytes: &[u8]| {
         file.iter().map(|c| (c.name.clone(), c.window, c.layer.clone())).collect()
     };
     let expected = names(file.channels());
-    let (input, output) = (DIR.join("in.exr"), DIR.join("out.exr"));
-    std::fs::write(&input, bytes).expect("writable");
+    let output = DIR.join("out.exr");
     let color = vec![0.5; 3 * pixels];
-    if write_denoised(&input, &layout, &color, &output, &WriteOptions::default()).is_ok() {
+    // As `demc-infer denoise` does: what reading decoded is kept for writing, here no more than a part of it.
+    let mut file = file.keeping(&layout, 4096);
+    let _ = decode_input(&mut file, &layout);
+    if rewrite(&mut file, &layout, &color, &output, &WriteOptions::default()).is_ok() {
         let mut written = ExrFile::open(&output).expect("what was written is readable");
         assert_eq!(names(written.channels()), expected);
         let planes = written.read(&["R", "G", "B"]).expect("what was written is readable");

@@ -1,7 +1,6 @@
-//! Blocks of pixels by their place in the image. The file is not trusted: what it says is held against its length
+//! Blocks of pixels by their place in the image, as the file has them. The file is not trusted: what it says is held against its length
 //! before memory is allocated for it.
 
-use std::collections::HashMap;
 use std::io::{Read, Seek, SeekFrom};
 
 use ::exr::block::UncompressedBlock;
@@ -9,21 +8,18 @@ use ::exr::block::chunk::{
     Chunk, CompressedBlock, CompressedScanLineBlock, CompressedTileBlock, TileCoordinates,
 };
 use ::exr::error::Error as ExrError;
-use ::exr::meta::attribute::ChannelList;
 use ::exr::meta::header::Header;
 use ::exr::meta::{BlockDescription, MetaData, compute_block_count};
-use ::exr::prelude::{Compression, Vec2};
+use ::exr::prelude::Vec2;
 
+use super::decode::{check_density, decompress};
+use super::kept::Kept;
 use super::{MAX_PIXELS, MAX_SIDE};
 use crate::parallel::{self, processors};
 
-/// Blocks that are decoded or coded at once, in bytes of pixels, but at least one for each processor (ours: what stays in
-/// a cache).
+/// Blocks that are decoded or coded at once, in bytes of pixels, but at least one for each thread (ours: little beside an
+/// image).
 const BATCH_BYTES: usize = 8 << 20;
-/// A DWA block starts with this many 64-bit numbers: sizes, a version and a method.
-const DWA_SIZES: usize = 11;
-/// Largest size accepted there, in bytes: 256 lines of the widest image with a dozen channels and more.
-const MAX_DWA_BYTES: u64 = 1 << 29;
 
 /// Headers of a file, and its blocks on demand.
 pub(super) struct Source<R> {
@@ -35,16 +31,9 @@ pub(super) struct Source<R> {
     blocks: u64,
     /// Bytes in the file.
     length: u64,
-    kept: Kept,
-}
-
-/// Decoded blocks that will be asked for again.
-#[derive(Default)]
-struct Kept {
-    /// By part and place.
-    blocks: HashMap<(usize, Place), UncompressedBlock>,
-    /// Bytes for which there is room.
-    room: usize,
+    /// How many decode and code blocks.
+    pub(super) threads: usize,
+    pub(super) kept: Kept,
 }
 
 /// Column and row of a block.
@@ -95,30 +84,15 @@ impl<R: Read + Seek> Source<R> {
             tables,
             blocks,
             length,
+            threads: processors(),
             kept: Kept::default(),
         })
     }
 
-    /// Makes room for decoded blocks.
-    pub(super) fn make_room(&mut self, bytes: usize) {
-        self.kept.room = bytes;
-    }
-
-    /// Keeps decoded blocks, as many as there is room for.
-    pub(super) fn keep(&mut self, part: usize, places: &[Place], blocks: Vec<UncompressedBlock>) {
-        for (place, block) in places.iter().zip(blocks) {
-            if let Some(room) = self.kept.room.checked_sub(block.data.len()) {
-                self.kept.room = room;
-                self.kept.blocks.insert((part, *place), block);
-            }
-        }
-    }
-
-    /// Takes a block out of those that were kept.
-    fn take(&mut self, part: usize, place: Place) -> Option<UncompressedBlock> {
-        let block = self.kept.blocks.remove(&(part, place))?;
-        self.kept.room += block.data.len();
-        Some(block)
+    /// How many blocks of a part are decoded or coded at once.
+    pub(super) fn batch(&self, header: &Header) -> usize {
+        let blocks = BATCH_BYTES / block_bytes(header).max(1);
+        blocks.next_multiple_of(self.threads).max(self.threads)
     }
 
     /// The table of a part's blocks.
@@ -136,20 +110,22 @@ impl<R: Read + Seek> Source<R> {
         })
     }
 
-    /// Decodes blocks of the full-size image on all processors, but for those that were kept.
+    /// Decodes blocks of the full-size image, but for those that were kept.
     pub(super) fn decode(
         &mut self,
         part: usize,
         grid: &Grid,
         places: &[Place],
     ) -> Result<Vec<UncompressedBlock>, ExrError> {
-        let blocks = places.iter().map(|&place| match self.take(part, place) {
-            Some(block) => Ok(Block::Decoded(block)),
-            None => self.block(part, grid, place).map(Block::Compressed),
-        });
+        let blocks = places
+            .iter()
+            .map(|&place| match self.kept.take(part, place) {
+                Some(block) => Ok(Block::Decoded(block)),
+                None => self.block(part, grid, place).map(Block::Compressed),
+            });
         let blocks: Vec<Block> = blocks.collect::<Result<_, _>>()?;
         let meta = &self.meta;
-        let blocks = parallel::map(processors(), blocks, |block| match block {
+        let blocks = parallel::map(self.threads, blocks, |block| match block {
             Block::Decoded(block) => Ok(block),
             Block::Compressed(chunk) => decompress(meta, chunk),
         });
@@ -223,6 +199,13 @@ impl<R: Read + Seek> Source<R> {
                 "it is cut short: a block has {size} bytes, {room} are left"
             )));
         }
+        // What does not shrink is stored as it is. Blocks may lie over each other: many of this size may come at once.
+        let most = block_bytes(header);
+        if size > most as u64 {
+            return Err(invalid(format!(
+                "a block has {size} bytes for {most} bytes of pixels"
+            )));
+        }
         let mut compressed_pixels_le = Vec::with_capacity(usize::try_from(size)?);
         (&mut self.reader)
             .take(size)
@@ -243,64 +226,11 @@ impl<R: Read + Seek> Source<R> {
     }
 }
 
-/// How many blocks of so many bytes are decoded or coded at once.
-pub(super) fn batch(block_bytes: usize) -> usize {
-    let threads = processors();
-    (BATCH_BYTES / block_bytes.max(1))
-        .next_multiple_of(threads)
-        .max(threads)
-}
-
-/// Decompresses a block. Decoders allocate for all the pixels that it should have, and for the sizes at the start
-/// of a DWA block whatever they are: both are checked first.
-fn decompress(meta: &MetaData, chunk: Chunk) -> Result<UncompressedBlock, ExrError> {
-    let header = &meta.headers[chunk.layer_index];
-    let place = header.get_block_data_indices(&chunk.compressed_block)?;
-    let pixels = header
-        .get_absolute_block_pixel_coordinates(place)?
-        .size
-        .area();
-    if let CompressedBlock::ScanLine(CompressedScanLineBlock {
-        compressed_pixels_le: bytes,
-        ..
-    })
-    | CompressedBlock::Tile(CompressedTileBlock {
-        compressed_pixels_le: bytes,
-        ..
-    }) = &chunk.compressed_block
-    {
-        check_density(header, pixels, bytes.len() as u64)?;
-        if let Compression::DWAA(_) | Compression::DWAB(_) = header.compression {
-            let sizes = bytes.as_chunks().0.iter().take(DWA_SIZES);
-            let mut sizes = sizes.map(|&bytes| u64::from_le_bytes(bytes));
-            if sizes.any(|size| size > MAX_DWA_BYTES) {
-                return Err(invalid(
-                    "the sizes in a DWA block are impossible".to_owned(),
-                ));
-            }
-        }
-    }
-    UncompressedBlock::decompress_chunk(chunk, meta, false)
-}
-
-/// The bytes of a channel's line in a block; `y` counts from the top of the image.
-///
-/// # Panics
-/// If the block does not hold the line, or its part not the channel.
-pub(super) fn line<'a>(
-    block: &'a UncompressedBlock,
-    list: &ChannelList,
-    channel: usize,
-    y: usize,
-) -> &'a [u8] {
-    let width = block.index.pixel_size.width();
-    let (before, channel) = list
-        .channels_with_byte_offset()
-        .nth(channel)
-        .expect("a channel of the part");
-    let row = y - block.index.pixel_position.y();
-    let start = (row * list.bytes_per_pixel + before) * width;
-    &block.data[start..start + width * channel.sample_type.bytes_per_sample()]
+/// Bytes of pixels of a part's largest block.
+fn block_bytes(header: &Header) -> usize {
+    let (block, image) = (header.max_block_pixel_size(), header.layer_size);
+    let pixels = block.width().min(image.width()) * block.height().min(image.height());
+    pixels.saturating_mul(header.channels.bytes_per_pixel)
 }
 
 pub(super) fn invalid(detail: String) -> ExrError {
@@ -322,37 +252,4 @@ fn check_size(header: &Header) -> Result<(), ExrError> {
     Err(invalid(format!(
         "its size is {width}x{height}, not 1x1 to {MAX_SIDE}x{MAX_SIDE} with at most {MAX_PIXELS} pixels"
     )))
-}
-
-/// Checks that so many bytes can stand for so many pixels.
-fn check_density(header: &Header, pixels: usize, bytes: u64) -> Result<(), ExrError> {
-    let decoded = pixels as u64 * header.channels.bytes_per_pixel as u64;
-    match decoded <= bytes.saturating_mul(densest(header.compression)) {
-        true => Ok(()),
-        false => Err(invalid(format!(
-            "{bytes} bytes with {} cannot hold {decoded} bytes of pixels",
-            header.compression
-        ))),
-    }
-}
-
-/// The most bytes of pixels that a compressed byte can stand for.
-fn densest(compression: Compression) -> u64 {
-    match compression {
-        Compression::Uncompressed => 1,
-        // A run of 128 in two bytes.
-        Compression::RLE => 64,
-        // Deflate: 258 bytes in two bits.
-        Compression::ZIP1 | Compression::ZIP16 => 1032,
-        // Deflate, of three bytes in four.
-        Compression::PXR24 => 1376,
-        // Huffman codes: a run of 256 samples of two bytes in ten bits.
-        Compression::PIZ => 512,
-        // 16 samples of two bytes in three bytes.
-        Compression::B44 | Compression::B44A => 11,
-        // A flat square of 64 samples of four bytes is a number for its mean and one for the rest: 258 bytes of each in
-        // two bits.
-        Compression::DWAA(_) | Compression::DWAB(_) => 1 << 17,
-        Compression::HTJ2K32 | Compression::HTJ2K256 => u64::MAX,
-    }
 }

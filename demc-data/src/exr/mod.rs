@@ -17,6 +17,8 @@
 mod attributes;
 mod blocks;
 mod compression;
+mod decode;
+mod kept;
 mod plan;
 mod read;
 mod recode;

@@ -6,17 +6,19 @@ use std::path::{Path, PathBuf};
 
 use ::exr::block::UncompressedBlock;
 use ::exr::error::Error as ExrError;
-use ::exr::meta::attribute::{ChannelList, SampleType, Text};
+use ::exr::meta::attribute::{SampleType, Text};
 use ::exr::meta::header::Header;
 use ::exr::prelude::Vec2;
 use half::f16;
 
-use super::blocks::{Place, Source, batch, invalid, line};
+use super::blocks::{Place, Source, invalid};
+use super::decode::Span;
 use super::guarded;
-use crate::Error;
+use super::kept::Kept;
 use crate::channel::{Channel, Kind, Window, full_name};
-use crate::parallel::{self, processors};
+use crate::parallel;
 use crate::plane::Plane;
+use crate::{ChannelLayout, Error};
 
 /// An open file whose headers were read and checked; its pixels were not decoded yet.
 pub struct ExrFile<R = BufReader<File>> {
@@ -106,10 +108,17 @@ impl<R: Read + Seek> ExrFile<R> {
         })
     }
 
-    /// Keeps what [`read`](Self::read) decodes, up to so many bytes, for [`rewrite`](super::rewrite::rewrite): that part
-    /// of the file is then decompressed once, not twice.
-    pub fn keeping(mut self, bytes: usize) -> Self {
-        self.source.make_room(bytes);
+    /// Decodes and codes on so many threads, in place of as many as there are processors.
+    pub fn on_threads(mut self, threads: usize) -> Self {
+        self.source.threads = threads.max(1);
+        self
+    }
+
+    /// Keeps what [`read`](Self::read) decodes of the parts with the layout's colour, up to so many bytes, for
+    /// [`rewrite`](super::rewrite::rewrite): that is then decompressed once, not twice.
+    pub fn keeping(mut self, layout: &ChannelLayout, bytes: usize) -> Self {
+        let color = layout.color.iter().filter_map(|name| self.channel(name));
+        self.source.kept = Kept::new(color.map(|channel| channel.part).collect(), bytes);
         self
     }
 
@@ -157,7 +166,7 @@ pub(super) fn printable(name: &Text) -> String {
     name.replace(char::is_control, "\u{fffd}")
 }
 
-/// Decodes every full-size block of the parts that hold a wanted channel, on all processors.
+/// Decodes every full-size block of the parts that hold a wanted channel.
 fn decode<R: Read + Seek>(
     source: &mut Source<R>,
     wanted: &[Channel],
@@ -168,44 +177,43 @@ fn decode<R: Read + Seek>(
             continue;
         }
         let grid = source.grid(part)?;
-        let mut here: Vec<(&Channel, &mut Plane)> = wanted
-            .iter()
-            .zip(&mut planes)
-            .filter(|(channel, _)| channel.part == part)
-            .collect();
-        for (channel, plane) in &mut here {
-            reserve(plane, channel.window)?;
+        let header = &source.meta.headers[part];
+        let rows = source.batch(header).div_ceil(grid.columns);
+        let mut here = Vec::with_capacity(wanted.len());
+        for (channel, plane) in wanted.iter().zip(&mut planes) {
+            if channel.part == part {
+                reserve(plane, channel.window)?;
+                let span = Span::of(&header.channels, channel.index);
+                here.push((channel.window, span, plane));
+            }
         }
-        let list = &source.meta.headers[part].channels;
-        let rows = batch(grid.block.area() * list.bytes_per_pixel).div_ceil(grid.columns);
         for top in (0..grid.rows).step_by(rows) {
             let bottom = grid.rows.min(top + rows);
             let row = |row| (0..grid.columns).map(move |column| (column, row));
             let places: Vec<Place> = (top..bottom).flat_map(row).collect();
             let blocks = source.decode(part, &grid, &places)?;
-            let list = &source.meta.headers[part].channels;
-            let planes = here.iter_mut().collect();
-            parallel::map(processors(), planes, |(channel, plane)| {
-                let Window { width, height, .. } = channel.window;
-                grow(plane, width * height.min(bottom * grid.block.height()));
-                blocks
-                    .iter()
-                    .for_each(|block| copy(block, list, channel, plane));
+            let lines = bottom * grid.block.height();
+            let targets = here.iter_mut().collect();
+            parallel::map(source.threads, targets, |(window, span, plane)| {
+                grow(plane, window.width * window.height.min(lines));
+                for block in &blocks {
+                    copy(block, *span, window.width, plane);
+                }
             });
-            source.keep(part, &places, blocks);
+            source.kept.keep(part, &places, blocks);
         }
     }
     Ok(planes)
 }
 
-/// Copies a channel's samples in a block to where they belong.
-fn copy(block: &UncompressedBlock, list: &ChannelList, channel: &Channel, plane: &mut Plane) {
+/// Copies a channel's samples in a block to where they belong in an image of this width.
+fn copy(block: &UncompressedBlock, span: Span, image_width: usize, plane: &mut Plane) {
     let (Vec2(left, top), Vec2(width, height)) =
         (block.index.pixel_position, block.index.pixel_size);
     for y in top..top + height {
-        let start = y * channel.window.width + left;
+        let start = y * image_width + left;
         let samples = start..start + width;
-        let bytes = line(block, list, channel.index, y);
+        let bytes = span.line(block, y);
         match plane {
             Plane::Half(plane) => put(bytes, &mut plane[samples], f16::from_ne_bytes),
             Plane::Float(plane) => put(bytes, &mut plane[samples], f32::from_ne_bytes),

@@ -10,17 +10,18 @@ use ::exr::block::chunk::{
 };
 use ::exr::block::writer::{ChunkWriter, ChunksWriter};
 use ::exr::error::{Error as ExrError, UnitResult};
-use ::exr::meta::attribute::{ChannelList, SampleType};
+use ::exr::meta::attribute::SampleType;
 use ::exr::meta::header::Header;
 use ::exr::meta::{BlockDescription, Headers};
 use ::exr::prelude::{Compression, Vec2};
 use half::f16;
 
-use super::blocks::{Grid, Place, Source, batch, line};
+use super::blocks::{Grid, Place, Source};
+use super::decode::Span;
 use super::plan::{Origin, Plan};
 use super::write::{io_error, saturated_half};
 use super::{ExrFile, attributes, guarded, zip};
-use crate::parallel::{self, processors};
+use crate::parallel;
 use crate::{Error, file};
 
 /// Writes what was planned; returns how many samples of the colour are beyond half's range.
@@ -122,25 +123,18 @@ impl<R: Read + Seek> Recoder<'_, R> {
         blocks: &mut ChunkWriter<W>,
     ) -> UnitResult {
         let header = &self.headers[part];
-        let carries = origins.iter().any(|origin| origin.plane.is_none());
-        let mut carried = Carried {
-            part: from,
-            grid: self.input.get(|source| source.grid(from))?,
-            blocks: BTreeMap::new(),
-        };
-        let block_bytes = header.max_block_pixel_size().area() * header.channels.bytes_per_pixel;
-        for batch in targets(header)?.chunks(batch(block_bytes)) {
-            if carries {
-                carried.fetch(&mut self.input, batch)?;
-            }
-            let list = &self.input.source.meta.headers[from].channels;
+        let grid = self.input.get(|source| source.grid(from))?;
+        let source = &self.input.source;
+        let (batch, threads) = (source.batch(header), source.threads);
+        let mut carried = Carried::new(from, grid, &source.meta.headers[from], origins);
+        for batch in targets(header)?.chunks(batch) {
+            carried.fetch(&mut self.input, batch)?;
             let code = |target: &Target| -> Result<(usize, Chunk, usize), ExrError> {
-                let (data, clamped) =
-                    assemble(header, target, origins, self.color_hdr, &carried, list);
+                let (data, clamped) = assemble(header, target, self.color_hdr, &carried);
                 let chunk = compress(part, header, target, data)?;
                 Ok((target.index, chunk, clamped))
             };
-            for coded in parallel::map(processors(), batch.iter().collect(), code) {
+            for coded in parallel::map(threads, batch.iter().collect(), code) {
                 let (index, chunk, clamped) = coded?;
                 blocks.write_chunk(index, chunk)?;
                 self.clamped += clamped;
@@ -179,26 +173,25 @@ fn targets(header: &Header) -> Result<Vec<Target>, ExrError> {
 fn assemble(
     header: &Header,
     target: &Target,
-    origins: &[Origin],
     color_hdr: &[f32],
     carried: &Carried,
-    list: &ChannelList,
 ) -> (Vec<u8>, usize) {
     let Vec2(image_width, image_height) = header.layer_size;
     let (Vec2(x, top), Vec2(width, height)) = (target.corner, target.size);
     let mut data = Vec::with_capacity(target.size.area() * header.channels.bytes_per_pixel);
     let mut clamped = 0;
     for y in top..top + height {
-        for (channel, origin) in header.channels.list.iter().zip(origins) {
-            match origin.plane {
-                Some(plane) => {
+        let block = carried.blocks.get(&carried.grid.place(Vec2(x, y)));
+        for (channel, content) in header.channels.list.iter().zip(&carried.contents) {
+            match content {
+                Content::Color(plane) => {
                     let start = (plane * image_height + y) * image_width + x;
                     let line = &color_hdr[start..start + width];
                     clamped += put(line, channel.sample_type, &mut data);
                 }
-                None => {
-                    let block = &carried.blocks[&carried.grid.place(Vec2(x, y))];
-                    data.extend_from_slice(line(block, list, origin.index, y));
+                Content::Carried(span) => {
+                    let block = block.expect("fetched before");
+                    data.extend_from_slice(span.line(block, y));
                 }
             }
         }
@@ -235,20 +228,47 @@ fn compress(
     })
 }
 
-/// The channels that come from the input: those of its blocks that the batch at hand needs.
+/// What a channel of the output has.
+enum Content {
+    /// A plane of the denoised colour.
+    Color(usize),
+    /// A channel of the input's blocks.
+    Carried(Span),
+}
+
+/// The channels of a part, and those of the input's blocks that the batch at hand needs.
 struct Carried {
     part: usize,
     grid: Grid,
+    /// In the order of the output's channels.
+    contents: Vec<Content>,
     blocks: BTreeMap<Place, UncompressedBlock>,
 }
 
 impl Carried {
+    fn new(part: usize, grid: Grid, input: &Header, origins: &[Origin]) -> Self {
+        let content = |origin: &Origin| match origin.plane {
+            Some(plane) => Content::Color(plane),
+            None => Content::Carried(Span::of(&input.channels, origin.index)),
+        };
+        Self {
+            part,
+            grid,
+            contents: origins.iter().map(content).collect(),
+            blocks: BTreeMap::new(),
+        }
+    }
+
     /// Decodes the blocks that hold pixels of these targets, but for those at hand.
     fn fetch<R: Read + Seek>(
         &mut self,
         input: &mut Input<'_, R>,
         targets: &[Target],
     ) -> UnitResult {
+        let carries = |content: &Content| matches!(content, Content::Carried(_));
+        if !self.contents.iter().any(carries) {
+            return Ok(());
+        }
         let places = targets.iter().flat_map(|target| {
             let (column, first) = self.grid.place(target.corner);
             let (_, last) = self.grid.place(target.corner + target.size - Vec2(1, 1));

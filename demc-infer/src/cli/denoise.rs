@@ -9,7 +9,7 @@ use demc_data::exr::ExrFile;
 use demc_data::frame::decode_input;
 use demc_infer::denoise::SeamError;
 use demc_infer::guard::EnergyBias;
-use demc_infer::{Bundle, Picture};
+use demc_infer::{Bundle, Picture, memory};
 
 use super::inputs::{Frames, Inputs};
 use super::jobs::{Job, Jobs};
@@ -18,9 +18,15 @@ use super::writing::Writing;
 use super::{Clamped, DeviceFlag, Model};
 use crate::progress::Progress;
 
-/// Decoded blocks of an input that are kept until its output is written (ours: 19 half channels of 1920x1080 three times;
-/// what is beyond is decompressed twice).
-const KEPT_BYTES: usize = 256 << 20;
+/// Most bytes of an input's decoded blocks that are kept until its output is written (ours: 19 half channels of 1920x1080
+/// three times; what is beyond is decompressed twice).
+const MOST_KEPT: u64 = 256 << 20;
+
+/// How many are kept with the memory that there is: the network needs most of it.
+fn kept_bytes() -> usize {
+    let room = memory::available().map_or(MOST_KEPT, |bytes| bytes / 16);
+    room.min(MOST_KEPT) as usize
+}
 
 /// Denoise OpenEXR images of any size.
 ///
@@ -118,8 +124,9 @@ impl Denoise {
     /// Returns the number of negative samples that were set to 0.
     fn image(&self, job: &Job, bundle: &Bundle, progress: &Progress) -> anyhow::Result<usize> {
         let name = job.input.display();
-        let mut file = ExrFile::open(&job.input)?.keeping(KEPT_BYTES);
-        let frame = decode_input(&mut file, &bundle.meta.layout)?;
+        let layout = &bundle.meta.layout;
+        let mut file = ExrFile::open(&job.input)?.keeping(layout, kept_bytes());
+        let frame = decode_input(&mut file, layout)?;
         for warning in bundle.warnings(&frame)? {
             progress.line(format_args!("warning: {name}: {warning}"));
         }

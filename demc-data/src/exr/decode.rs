@@ -1,0 +1,119 @@
+//! From a block's bytes to its samples. The file is not trusted: what a block promises is held against its length first.
+
+use ::exr::block::UncompressedBlock;
+use ::exr::block::chunk::{Chunk, CompressedBlock, CompressedScanLineBlock, CompressedTileBlock};
+use ::exr::error::Error as ExrError;
+use ::exr::meta::MetaData;
+use ::exr::meta::attribute::ChannelList;
+use ::exr::meta::header::Header;
+use ::exr::prelude::{Compression, Vec2};
+
+use super::blocks::invalid;
+
+/// A DWA block starts with this many 64-bit numbers: sizes, a version and a method.
+const DWA_SIZES: usize = 11;
+/// What compression may add to a part of a DWA block that does not shrink, in bytes (ours).
+const DWA_MARGIN: u64 = 1 << 16;
+
+/// Decompresses a block. Decoders allocate for all the pixels that it should have, and for the sizes at the start
+/// of a DWA block whatever they are: both are checked first.
+pub(super) fn decompress(meta: &MetaData, chunk: Chunk) -> Result<UncompressedBlock, ExrError> {
+    let header = &meta.headers[chunk.layer_index];
+    let place = header.get_block_data_indices(&chunk.compressed_block)?;
+    let area = header.get_absolute_block_pixel_coordinates(place)?.size;
+    if let CompressedBlock::ScanLine(CompressedScanLineBlock {
+        compressed_pixels_le: bytes,
+        ..
+    })
+    | CompressedBlock::Tile(CompressedTileBlock {
+        compressed_pixels_le: bytes,
+        ..
+    }) = &chunk.compressed_block
+    {
+        check_density(header, area.area(), bytes.len() as u64)?;
+        if let Compression::DWAA(_) | Compression::DWAB(_) = header.compression {
+            let sizes = bytes.as_chunks().0.iter().take(DWA_SIZES);
+            let mut sizes = sizes.map(|&bytes| u64::from_le_bytes(bytes));
+            // Samples of squares of 8, the cut ones too, of two bytes or of four, and what compression may add.
+            let Vec2(width, height) = area;
+            let padded = width.next_multiple_of(8) * height.next_multiple_of(8);
+            let most = 2 * padded as u64 * header.channels.bytes_per_pixel as u64 + DWA_MARGIN;
+            if sizes.any(|size| size > most) {
+                return Err(invalid(
+                    "the sizes in a DWA block are impossible".to_owned(),
+                ));
+            }
+        }
+    }
+    UncompressedBlock::decompress_chunk(chunk, meta, false)
+}
+
+/// Where a channel's samples are in the lines of a part's blocks.
+#[derive(Clone, Copy)]
+pub(super) struct Span {
+    /// Bytes of a pixel in all channels, and in those before this one.
+    pixel: usize,
+    before: usize,
+    /// Bytes of a sample.
+    sample: usize,
+}
+
+impl Span {
+    /// That of the channel with this index.
+    ///
+    /// # Panics
+    /// If the part has no such channel.
+    pub(super) fn of(list: &ChannelList, index: usize) -> Self {
+        let mut channels = list.channels_with_byte_offset();
+        let (before, channel) = channels.nth(index).expect("a channel of the part");
+        Self {
+            pixel: list.bytes_per_pixel,
+            before,
+            sample: channel.sample_type.bytes_per_sample(),
+        }
+    }
+
+    /// The channel's bytes of a line in a block; `y` counts from the top of the image.
+    ///
+    /// # Panics
+    /// If the block does not hold the line.
+    pub(super) fn line(self, block: &UncompressedBlock, y: usize) -> &[u8] {
+        let width = block.index.pixel_size.width();
+        let row = y - block.index.pixel_position.y();
+        let start = (row * self.pixel + self.before) * width;
+        &block.data[start..start + width * self.sample]
+    }
+}
+
+/// Checks that so many bytes can stand for so many pixels.
+pub(super) fn check_density(header: &Header, pixels: usize, bytes: u64) -> Result<(), ExrError> {
+    let decoded = pixels as u64 * header.channels.bytes_per_pixel as u64;
+    match decoded <= bytes.saturating_mul(densest(header.compression)) {
+        true => Ok(()),
+        false => Err(invalid(format!(
+            "{bytes} bytes with {} cannot hold {decoded} bytes of pixels",
+            header.compression
+        ))),
+    }
+}
+
+/// The most bytes of pixels that a compressed byte can stand for.
+fn densest(compression: Compression) -> u64 {
+    match compression {
+        Compression::Uncompressed => 1,
+        // A run of 128 in two bytes.
+        Compression::RLE => 64,
+        // Deflate: 258 bytes in two bits.
+        Compression::ZIP1 | Compression::ZIP16 => 1032,
+        // Deflate, of three bytes in four.
+        Compression::PXR24 => 1376,
+        // Huffman codes: a run of 256 samples of two bytes in ten bits.
+        Compression::PIZ => 512,
+        // 16 samples of two bytes in three bytes.
+        Compression::B44 | Compression::B44A => 11,
+        // A flat square of 64 samples of four bytes is a number for its mean and one for the rest: 258 bytes of each in
+        // two bits.
+        Compression::DWAA(_) | Compression::DWAB(_) => 1 << 17,
+        Compression::HTJ2K32 | Compression::HTJ2K256 => u64::MAX,
+    }
+}
