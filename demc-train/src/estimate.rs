@@ -19,8 +19,8 @@ const FORWARD_SHARE: f64 = 0.3;
 /// Patches of the larger of two batches that are timed; ours: enough to fill the kernels.
 const SEVERAL: usize = 4;
 
-/// Seconds after which a step is not timed again: what comes once, such as fetching memory, is little of it.
-const LONG: f64 = 1.0;
+/// Seconds after which a step is not timed again: by then what comes once, such as compiling shaders, is little of it (ours).
+const LONG: f64 = 30.0;
 
 /// A run's duration, roughly.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -53,12 +53,10 @@ impl Estimate {
                 short => short.min(once(&batch)),
             }
         };
-        let one = time(1);
         // No more than a batch of the run: there may be no memory for them.
-        let patch_time = match SEVERAL.min(config.data.batch_size) {
-            1 => one,
-            several => ((time(several) - one) / (several - 1) as f64).clamp(0.1 * one, one),
-        };
+        let several = SEVERAL.min(config.data.batch_size);
+        let one = time(1);
+        let patch_time = patch_time(one, several, if several > 1 { time(several) } else { one });
         let pixels: usize = data
             .validation
             .iter()
@@ -74,6 +72,15 @@ impl Estimate {
             validation,
             left,
         }
+    }
+}
+
+/// What one more patch takes, from the times of a step with one and of one with several.
+fn patch_time(one: f64, several: usize, time: f64) -> f64 {
+    match several {
+        0 | 1 => one,
+        // Times have noise: a patch is neither free nor dearer than a step of its own.
+        _ => ((time - one) / (several - 1) as f64).clamp(0.1 * one, one),
     }
 }
 
@@ -120,6 +127,15 @@ fn human(duration: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_patch_takes_what_it_adds_to_a_step() {
+        // A step of 100 ms and 50 ms a patch.
+        assert!((patch_time(0.15, 4, 0.3) - 0.05).abs() < 1e-12);
+        assert_eq!(patch_time(0.15, 1, 0.15), 0.15);
+        assert_eq!(patch_time(0.2, 4, 0.1), 0.1 * 0.2);
+        assert_eq!(patch_time(0.2, 2, 0.9), 0.2);
+    }
 
     #[test]
     fn durations_have_two_units_at_most() {

@@ -1,4 +1,4 @@
-//! The learning-rate finder (Smith 2017): trains a fresh network while the rate climbs, until the loss diverges.
+//! The learning-rate finder (Smith 2017): trains the network that a run begins with while the rate climbs, until the loss diverges.
 //!
 //! The loss of a step says more about its patches than about the rate: here it is a ratio to what the untrained network loses
 //! on the same patches, and smoothed.

@@ -26,7 +26,12 @@ pub fn initial_model(
     }
     let Bundle { meta, model } = Bundle::load(init, device).context("train.init")?;
     let mut there = config.clone();
-    there.model = meta.model;
+    // How it was drawn is all the same.
+    there.model = ModelConfig {
+        head: config.model.head,
+        detail: config.model.detail,
+        ..meta.model
+    };
     there.data.gamma = meta.normalizer.gamma;
     let differences = config.differences(&there);
     ensure!(

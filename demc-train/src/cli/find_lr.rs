@@ -11,7 +11,7 @@ use demc_train::progress::{Progress, say};
 
 use super::ComputeArguments;
 
-/// Find a learning rate: train a fresh network while the rate climbs, and stop when the loss diverges
+/// Find a learning rate: train the network that the run begins with while the rate climbs, and stop when the loss diverges
 ///
 /// Writes every step to STEM.csv and a picture to STEM.svg and STEM.png. No run directory is touched.
 #[derive(Debug, Args)]

@@ -227,8 +227,7 @@ impl Config {
 
     /// The keys by which a run of `self` would differ from one of `other`; empty if one may continue the other.
     ///
-    /// Where the run, its data and the weights that it began with are kept (scenes, statistics and layout are compared on
-    /// their own), when checkpoints are written and which stay, what happens at a step that is not finite, and threads and memory of the loader change no
+    /// Where the run and its data are kept (scenes, statistics and layout are compared on their own), when checkpoints are written and which stay, what happens at a step that is not finite, and threads and memory of the loader change no
     /// number of the run so far.
     pub fn differences(&self, other: &Config) -> Vec<String> {
         let essence = |config: &Config| {
@@ -240,7 +239,6 @@ impl Config {
                 ..RunConfig::default()
             };
             config.train.on_nan = OnNan::default();
-            config.train.init = PathBuf::new();
             config.data.root = PathBuf::new();
             config.data.layout = String::new();
             config.data.workers = DataConfig::default().workers;
@@ -377,5 +375,9 @@ mod tests {
         assert!(moved.differences(&config).is_empty());
         moved.train.seed = 9;
         assert_eq!(moved.differences(&config), ["train.seed = 9, there 1"]);
+        moved.train = config.train.clone();
+        moved.train.init = "runs/other".into();
+        let begun = "train.init = \"runs/other\", there \"\"";
+        assert_eq!(moved.differences(&config), [begun]);
     }
 }
