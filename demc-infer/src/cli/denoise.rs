@@ -162,10 +162,7 @@ impl Denoise {
                 .write_png(&path)
                 .with_context(|| format!("cannot write {}", path.display()))?;
         }
-        for note in self
-            .writing
-            .write(&mut file, job, &bundle.meta.layout, image)?
-        {
+        for note in self.writing.write(&mut file, job, layout, image)? {
             progress.line(format_args!("note: {name}: {note}"));
         }
         Ok(frame.clamped)

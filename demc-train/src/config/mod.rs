@@ -227,7 +227,8 @@ impl Config {
 
     /// The keys by which a run of `self` would differ from one of `other`; empty if one may continue the other.
     ///
-    /// Where the run and its data are kept (scenes, statistics and layout are compared on their own), when checkpoints are written and which stay, what happens at a step that is not finite, and threads and memory of the loader change no
+    /// Where the run and its data are kept (scenes, statistics and layout are compared on their own), when checkpoints are
+    /// written and which stay, what happens at a step that is not finite, and threads and memory of the loader change no
     /// number of the run so far.
     pub fn differences(&self, other: &Config) -> Vec<String> {
         let essence = |config: &Config| {
