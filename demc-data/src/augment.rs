@@ -3,11 +3,14 @@
 //!
 //! Flips and transposes move pixels: normals and positions are world-space values of a pixel, so they move with it and
 //! keep their numbers. A permutation of red, green and blue is the same for colour, textures and reference, an
-//! exposure the same for colour and reference: light transport is linear in both.
+//! exposure the same for colour and reference: light transport is linear in both. A crop is a patch of the same scene that
+//! need not lie on the grid: the network halves its input five times, and what is on the grid is always halved alike. Noise is drawn anew from the pixels of
+//! the same surface ([`crate::resample`]).
 
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
 
+use crate::Patch;
 use crate::seed::{Use, generator};
 
 /// An exposure is drawn between minus and plus so many stops (factors of 2); ours.
@@ -23,8 +26,8 @@ const RGB_ORDERS: [[usize; 3]; 6] = [
     [2, 1, 0],
 ];
 
-/// Which augmentations are drawn. In a configuration: `true` (all), `false`, or a list of `"flip"`, `"transpose"`, `"rgb"`
-/// and `"exposure"`.
+/// Which augmentations are drawn. In a configuration: `true` (all), `false`, or a list of `"flip"`, `"transpose"`, `"rgb"`,
+/// `"exposure"`, `"crop"` and `"noise"`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "Setting", into = "Setting")]
 pub struct Augment {
@@ -36,12 +39,16 @@ pub struct Augment {
     pub rgb: bool,
     /// Multiply colour and reference by `2^u`, u uniform from -1 to 1.
     pub exposure: bool,
+    /// Cut the patch anywhere in its scene, not on the grid.
+    pub crop: bool,
+    /// Give pixels the noise of others nearby that are like them ([`crate::resample`]).
+    pub noise: bool,
 }
 
 #[derive(Serialize, Deserialize)]
 #[serde(
     untagged,
-    expecting = "augment must be true, false or a list of \"flip\", \"transpose\", \"rgb\" and \"exposure\""
+    expecting = "augment must be true, false or a list of \"flip\", \"transpose\", \"rgb\", \"exposure\", \"crop\" and \"noise\""
 )]
 enum Setting {
     All(bool),
@@ -55,9 +62,18 @@ enum Kind {
     Transpose,
     Rgb,
     Exposure,
+    Crop,
+    Noise,
 }
 
-const KINDS: [Kind; 4] = [Kind::Flip, Kind::Transpose, Kind::Rgb, Kind::Exposure];
+const KINDS: [Kind; 6] = [
+    Kind::Flip,
+    Kind::Transpose,
+    Kind::Rgb,
+    Kind::Exposure,
+    Kind::Crop,
+    Kind::Noise,
+];
 
 impl Augment {
     fn has(self, kind: Kind) -> bool {
@@ -66,6 +82,8 @@ impl Augment {
             Kind::Transpose => self.transpose,
             Kind::Rgb => self.rgb,
             Kind::Exposure => self.exposure,
+            Kind::Crop => self.crop,
+            Kind::Noise => self.noise,
         }
     }
 
@@ -75,6 +93,8 @@ impl Augment {
             transpose: kinds.contains(&Kind::Transpose),
             rgb: kinds.contains(&Kind::Rgb),
             exposure: kinds.contains(&Kind::Exposure),
+            crop: kinds.contains(&Kind::Crop),
+            noise: kinds.contains(&Kind::Noise),
         }
     }
 }
@@ -103,6 +123,8 @@ impl From<Augment> for Setting {
 /// What was drawn for one patch.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Variation {
+    /// Where the patch is cut, if not on the grid: from top to bottom and from left to right, 0 to below 1.
+    crop: Option<[f64; 2]>,
     flip_x: bool,
     flip_y: bool,
     transpose: bool,
@@ -110,6 +132,8 @@ pub struct Variation {
     pub rgb: [usize; 3],
     /// Factor on colour and reference.
     pub exposure: f32,
+    /// What other noise is drawn from, if it is another one.
+    pub noise: Option<u64>,
 }
 
 impl Augment {
@@ -120,17 +144,34 @@ impl Augment {
         let bits = rng.next_u32();
         let order = RGB_ORDERS[rng.random_range(0..RGB_ORDERS.len())];
         let stops = rng.random_range(-EXPOSURE_STOPS..EXPOSURE_STOPS);
+        let noise = rng.next_u64();
+        let crop = [rng.random(), rng.random()];
         Variation {
+            crop: self.crop.then_some(crop),
             flip_x: self.flip && bits & 1 != 0,
             flip_y: self.flip && bits & 2 != 0,
             transpose: self.transpose && bits & 4 != 0,
             rgb: if self.rgb { order } else { RGB_ORDERS[0] },
             exposure: if self.exposure { stops.exp2() } else { 1.0 },
+            noise: self.noise.then_some(noise),
         }
     }
 }
 
 impl Variation {
+    /// Where `patch` of `size` is cut in its scene of `height` and `width`, which it fits into.
+    pub fn place(self, patch: Patch, (height, width): (usize, usize), size: usize) -> Patch {
+        let origin = |side: usize, share: f64| ((side - size + 1) as f64 * share) as u32;
+        match self.crop {
+            None => patch,
+            Some([y, x]) => Patch {
+                y: origin(height, y),
+                x: origin(width, x),
+                ..patch
+            },
+        }
+    }
+
     /// Turns square planes in place.
     ///
     /// # Shapes
@@ -162,17 +203,21 @@ mod tests {
     use super::*;
 
     const NONE: Variation = Variation {
+        crop: None,
         flip_x: false,
         flip_y: false,
         transpose: false,
         rgb: [0, 1, 2],
         exposure: 1.0,
+        noise: None,
     };
     const TURNS: Augment = Augment {
         flip: true,
         transpose: true,
         rgb: false,
         exposure: false,
+        crop: false,
+        noise: false,
     };
 
     fn turned(orientation: Variation) -> Vec<f32> {
@@ -240,6 +285,26 @@ mod tests {
         assert!((0.5..0.55).contains(&least) && (1.8..2.0).contains(&most));
     }
 
+    /// A patch of 32 in a scene of 36 x 34 has five rows and three columns to begin in.
+    #[test]
+    fn crops_are_everywhere_in_the_scene_and_in_it() {
+        let patch = Patch {
+            scene: 0,
+            y: 4,
+            x: 2,
+        };
+        let crop = Augment::of(&[Kind::Crop]);
+        let mut counts = [[0; 3]; 5];
+        for position in 0..1500 {
+            let placed = crop.draw(1, 0, position).place(patch, (36, 34), 32);
+            counts[placed.y as usize][placed.x as usize] += 1;
+        }
+        // 100 expected each, deviation 10.
+        let all = counts.iter().flatten();
+        assert!(all.clone().all(|n| (60..140).contains(n)), "{counts:?}");
+        assert_eq!(NONE.place(patch, (36, 34), 32), patch);
+    }
+
     /// What else is on does not change what one augmentation draws.
     #[test]
     fn augmentations_are_independent_of_each_other() {
@@ -267,6 +332,10 @@ mod tests {
                 "augment = [\"exposure\", \"rgb\"]",
                 only(&[Kind::Rgb, Kind::Exposure]),
             ),
+            (
+                "augment = [\"noise\", \"crop\"]",
+                only(&[Kind::Crop, Kind::Noise]),
+            ),
             ("augment = []", Augment::default()),
         ] {
             let table: Table = toml::from_str(text).expect(text);
@@ -276,9 +345,9 @@ mod tests {
         }
         let error = toml::from_str::<Table>("augment = [\"rotate\"]").expect_err("unknown");
         assert!(
-            error
-                .message()
-                .contains("a list of \"flip\", \"transpose\", \"rgb\" and \"exposure\""),
+            error.message().contains(
+                "a list of \"flip\", \"transpose\", \"rgb\", \"exposure\", \"crop\" and \"noise\""
+            ),
             "{error}"
         );
     }

@@ -7,6 +7,7 @@ use crate::cache::{CacheUse, SceneCache};
 use crate::frame::{FEATURES, FramePlanes, TEXTURES};
 use crate::patch::{Patch, epoch_order, patches};
 use crate::plane::Plane;
+use crate::resample::resample_noise;
 use crate::{ChannelLayout, DataConfig, Error, Normalizer, Scene};
 
 /// Patches in the network's input space, with their references. B patches of P x P pixels.
@@ -20,7 +21,7 @@ pub struct Batch {
     pub features_z: Vec<f32>,
     /// Reference colour `[B, 3, P, P]`, linear HDR.
     pub reference_hdr: Vec<f32>,
-    /// Where each patch was cut, before any augmentation.
+    /// Where each patch was cut, before it was turned.
     pub patches: Vec<Patch>,
 }
 
@@ -160,8 +161,10 @@ impl PatchSource {
                 .take(self.batch_size - draws.len())
             {
                 let variation = self.augment.draw(self.seed, epoch, position);
+                let patch = self.patches[index as usize];
+                let scene = &self.cache.scenes()[patch.scene as usize];
                 draws.push(Draw {
-                    patch: self.patches[index as usize],
+                    patch: variation.place(patch, (scene.height, scene.width), self.patch_size),
                     variation,
                 });
                 position += 1;
@@ -184,6 +187,9 @@ impl PatchSource {
             let planes = order.iter().map(|plane| &planes[*plane]);
             cut_planes(planes, from.width, patch, size, out);
             variation.turn(out, size);
+        }
+        if let Some(seed) = variation.noise {
+            resample_noise(place.color, place.features, place.reference, size, seed);
         }
         for radiance in [&mut place.color, &mut place.reference] {
             radiance

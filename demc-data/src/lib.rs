@@ -33,6 +33,7 @@ pub mod patch;
 pub mod plane;
 pub mod ranges;
 pub mod reference_filter;
+pub mod resample;
 pub mod rgb;
 mod seed;
 pub mod stats;

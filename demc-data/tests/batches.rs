@@ -49,6 +49,8 @@ fn batches_are_the_same_for_any_number_of_workers() {
             transpose: true,
             rgb: true,
             exposure: true,
+            crop: true,
+            noise: true,
         },
         ..small()
     };
@@ -92,9 +94,25 @@ fn a_batch_larger_than_an_epoch_takes_from_several() {
     assert_eq!(patches.len(), 90);
 }
 
+/// On the grid and off it.
 #[test]
 fn a_patch_holds_the_pixels_of_its_place() {
-    let batch = source(&small()).batch(3).expect("the sample is sound");
+    holds_the_pixels_of_its_place(&source(&small()));
+    let cropped = source(&DataConfig {
+        augment: Augment {
+            crop: true,
+            ..Augment::default()
+        },
+        ..small()
+    });
+    holds_the_pixels_of_its_place(&cropped);
+    let on_grid: HashSet<_> = cropped.patches().iter().collect();
+    let cut = cropped.batch(3).expect("the sample is sound").patches;
+    assert!(cut.iter().all(|patch| !on_grid.contains(patch)), "{cut:?}");
+}
+
+fn holds_the_pixels_of_its_place(source: &PatchSource) {
+    let batch = source.batch(3).expect("the sample is sound");
     let scenes = train_scenes();
     for (b, patch) in batch.patches.iter().enumerate() {
         let frame =
@@ -119,6 +137,37 @@ fn a_patch_holds_the_pixels_of_its_place() {
             assert_eq!(batch.color_gamma[at(3, channel)], gamma);
         }
     }
+}
+
+/// Colour and second texture move among the pixels of a patch; what it shows does not.
+#[test]
+fn noise_changes_colour_and_second_texture_only() {
+    let batch = |noise| {
+        let augment = Augment {
+            noise,
+            ..Augment::default()
+        };
+        let source = source(&DataConfig { augment, ..small() });
+        source.batch(0).expect("the sample is sound")
+    };
+    let (plain, varied) = (batch(false), batch(true));
+    assert_eq!(varied.patches, plain.patches);
+    assert_eq!(varied.reference_hdr, plain.reference_hdr);
+    let pixels = 64 * 64;
+    let same = |a: &[f32], b: &[f32]| a.iter().zip(b).filter(|(a, b)| a == b).count();
+    let features = varied
+        .features_z
+        .chunks(pixels)
+        .zip(plain.features_z.chunks(pixels));
+    for (plane, (varied, plain)) in features.enumerate() {
+        if plane % FEATURES < 9 {
+            assert_eq!(varied, plain, "plane {plane}");
+        }
+    }
+    let share =
+        same(&varied.color_gamma, &plain.color_gamma) as f32 / plain.color_gamma.len() as f32;
+    assert!(share < 0.6, "{share} of the colour is what it was");
+    assert_ne!(varied.features_z, plain.features_z);
 }
 
 #[test]

@@ -82,8 +82,8 @@ impl<'a> Image<'a> {
     /// `clip(x, 0, 1)^(1 / 2.2)`, planar.
     pub(super) fn display(&self) -> &[f64] {
         once::<Vec<f64>>(&self.display, || {
-            let power = 1.0 / f64::from(DISPLAY_GAMMA);
-            let shown = |x: &f32| f64::from(x.clamp(0.0, 1.0)).powf(power);
+            let power = 1.0 / DISPLAY_GAMMA;
+            let shown = |x: &f32| f64::from(x.clamp(0.0, 1.0).powf(power));
             self.hdr.par_iter().map(shown).collect()
         })
     }
