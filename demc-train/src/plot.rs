@@ -32,7 +32,7 @@ struct Logged {
 }
 
 /// Draws the curves of `runs` (run directories) to STEM.svg and STEM.png: training loss, smoothed over its faint raw
-/// values, and validation RelMSE and SSIM; one colour a run, named by the end of its path that no other has. A last
+/// values, and validation RelMSE and SSIM where there are any; one colour a run, named by the end of its path that no other has. A last
 /// line that was not written to its end is left out.
 ///
 /// # Errors
@@ -70,7 +70,7 @@ fn log(path: &Path) -> anyhow::Result<Vec<Logged>> {
     Ok(lines)
 }
 
-/// Training loss, validation RelMSE, validation SSIM.
+/// Training loss; validation RelMSE and SSIM where a run has any.
 fn panels(runs: &[(&String, &Vec<Logged>)], options: &PlotOptions) -> Vec<Panel> {
     let scale = match options.linear {
         true => Scale::Linear,
@@ -96,8 +96,7 @@ fn panels(runs: &[(&String, &Vec<Logged>)], options: &PlotOptions) -> Vec<Panel>
         });
         curves.collect()
     };
-    vec![
-        panel("training loss", "loss", scale, losses),
+    let mut panels = vec![
         panel(
             "validation RelMSE",
             "RelMSE",
@@ -110,7 +109,11 @@ fn panels(runs: &[(&String, &Vec<Logged>)], options: &PlotOptions) -> Vec<Panel>
             Scale::Linear,
             validation(|line| line.valid_ssim),
         ),
-    ]
+    ];
+    // Runs that hold nothing out have no validation to show.
+    panels.retain(|panel| panel.series.iter().any(|curve| !curve.points.is_empty()));
+    panels.insert(0, panel("training loss", "loss", scale, losses));
+    panels
 }
 
 fn panel(title: &str, y_label: &str, y: Scale, series: Vec<Series>) -> Panel {
@@ -319,7 +322,9 @@ mod tests {
         assert!(!text.contains("no data") && png.exists());
         let [svg, _] = plot(&runs[2..], &dir.path().join("empty"), &OPTIONS).unwrap();
         let text = fs::read_to_string(svg).unwrap();
-        assert_eq!(text.matches("\nno data\n").count(), 3);
+        // No panels without a curve, but the one that every run has.
+        assert_eq!(text.matches("\nno data\n").count(), 1);
+        assert!(!text.contains("validation"));
     }
 
     #[test]

@@ -26,9 +26,8 @@ const SENSITIVITY: [[(f32, f32); 2]; 3] = [
 const WIDEST: f32 = 0.04;
 /// Width of the edge and point detectors, degrees.
 const FEATURE_WIDTH: f32 = 0.082;
-/// Exponents of the colour and of the feature difference.
+/// Exponent of the colour difference; that of the feature difference is a half.
 const COLOR_POWER: f32 = 0.7;
-const FEATURE_POWER: f32 = 0.5;
 /// Below this share of the largest colour difference, errors take up to [`KNEE_VALUE`] of the scale.
 const KNEE: f32 = 0.4;
 const KNEE_VALUE: f32 = 0.95;
@@ -58,7 +57,7 @@ pub fn flip(candidate: &Image, reference: &Image) -> f64 {
                 KNEE_VALUE + (color - knee) / (largest - knee) * (1.0 - KNEE_VALUE)
             };
             let feature = (edge_x - edge_y).abs().max((point_x - point_y).abs());
-            let feature = (feature / 2.0_f32.sqrt()).powf(FEATURE_POWER);
+            let feature = (feature / 2.0_f32.sqrt()).sqrt();
             color.powf(1.0 - feature)
         })
         .collect();
@@ -77,6 +76,15 @@ impl Appearance {
     /// Of display values in 0 to 1, planar.
     pub(super) fn new(display: &[f64], width: usize) -> Self {
         let pixels = display.len() / 3;
+        let mut planes = display.chunks(pixels);
+        if pixels > 1 && planes.all(|plane| plane.iter().all(|value| *value == plane[0])) {
+            // One colour, as the black image: what is seen of one pixel is seen everywhere, for filters repeat the edge.
+            let one = Self::new(&[0, 1, 2].map(|c| display[c * pixels]), 1);
+            return Self {
+                lab: vec![one.lab[0]; pixels],
+                features: vec![one.features[0]; pixels],
+            };
+        }
         let opponent: Vec<Color> = (0..pixels)
             .into_par_iter()
             .map(|i| {

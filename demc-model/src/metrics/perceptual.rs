@@ -21,10 +21,10 @@ pub fn ssim(candidate: &Image, reference: &Image) -> Option<f64> {
     if height < SSIM_WINDOW || width < SSIM_WINDOW {
         return None;
     }
-    let pixels = height * width;
-    let channels = candidate.display().par_chunks(pixels);
-    let channels = channels.zip(reference.display().par_chunks(pixels));
-    let of_channels: Vec<f64> = channels.map(|(c, r)| ssim_plane(c, r, width)).collect();
+    let channels = (0..3).into_par_iter();
+    let of_channels: Vec<f64> = channels
+        .map(|channel| ssim_plane(candidate, reference, channel))
+        .collect();
     Some(of_channels.iter().sum::<f64>() / 3.0)
 }
 
@@ -34,32 +34,60 @@ pub fn ssim(candidate: &Image, reference: &Image) -> Option<f64> {
 /// Where the sizes differ.
 pub fn psnr(candidate: &Image, reference: &Image) -> Option<f64> {
     candidate.assert_size_of(reference);
-    let pairs = candidate.display().iter().zip(reference.display());
-    let sum: f64 = pairs.map(|(c, r)| (c - r).powi(2)).sum();
+    let rows = candidate.display().par_chunks(candidate.size().1);
+    let rows = rows.zip(reference.display().par_chunks(candidate.size().1));
+    let squares = |(c, r): (&[f64], &[f64])| c.iter().zip(r).map(|(c, r)| (c - r).powi(2)).sum();
+    // Added in order: the same number on any number of threads.
+    let of_rows: Vec<f64> = rows.map(squares).collect();
+    let sum: f64 = of_rows.iter().sum();
     (sum > 0.0).then(|| -10.0 * (sum / reference.display().len() as f64).log10())
 }
 
+/// What SSIM needs of one image's channel in all windows that lie inside: Gaussian means of the values and of their squares.
+pub(super) struct Moments {
+    mean: Vec<f64>,
+    square: Vec<f64>,
+}
+
+impl Moments {
+    /// Of each channel of an image as it is displayed, planar `[3, H, width]`, larger than the window.
+    pub(super) fn new(display: &[f64], width: usize) -> Vec<Self> {
+        let channels = display.par_chunks(display.len() / 3);
+        let moments = channels.map(|plane| Self {
+            mean: blur(plane, width),
+            square: blur(&product(plane, plane), width),
+        });
+        moments.collect()
+    }
+}
+
 /// Mean over all windows that lie inside, of one channel.
-fn ssim_plane(x: &[f64], y: &[f64], width: usize) -> f64 {
+fn ssim_plane(candidate: &Image, reference: &Image, channel: usize) -> f64 {
     const C1: f64 = 0.01 * 0.01;
     const C2: f64 = 0.03 * 0.03;
-    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect::<Vec<_>>();
-    let taps = gaussian();
-    let blur = |plane: &[f64]| separable(plane, width, &taps, &taps, Edge::Valid);
-    let (mean_x, mean_y) = (blur(x), blur(y));
-    let (xx, yy, xy) = (
-        blur(&product(x, x)),
-        blur(&product(y, y)),
-        blur(&product(x, y)),
-    );
-    let sum: f64 = (0..mean_x.len())
+    let (height, width) = candidate.size();
+    let plane = channel * height * width..(channel + 1) * height * width;
+    let display = [candidate, reference].map(|image| &image.display()[plane.clone()]);
+    let xy = blur(&product(display[0], display[1]), width);
+    let (x, y) = (&candidate.moments()[channel], &reference.moments()[channel]);
+    let sum: f64 = (0..xy.len())
         .map(|i| {
-            let (mx, my) = (mean_x[i], mean_y[i]);
-            let (vx, vy, cov) = (xx[i] - mx * mx, yy[i] - my * my, xy[i] - mx * my);
+            let (mx, my) = (x.mean[i], y.mean[i]);
+            let (vx, vy) = (x.square[i] - mx * mx, y.square[i] - my * my);
+            let cov = xy[i] - mx * my;
             ((2.0 * mx * my + C1) * (2.0 * cov + C2)) / ((mx * mx + my * my + C1) * (vx + vy + C2))
         })
         .sum();
-    sum / mean_x.len() as f64
+    sum / xy.len() as f64
+}
+
+fn product(a: &[f64], b: &[f64]) -> Vec<f64> {
+    a.iter().zip(b).map(|(a, b)| a * b).collect()
+}
+
+fn blur(plane: &[f64], width: usize) -> Vec<f64> {
+    let taps = gaussian();
+    separable(plane, width, &taps, &taps, Edge::Valid)
 }
 
 fn gaussian() -> [f64; SSIM_WINDOW] {

@@ -1,0 +1,87 @@
+"""What a room is painted with, as arrays of numbers: colours, textures, pictures and the sky outside."""
+
+from __future__ import annotations
+
+import colorsys
+
+import numpy as np
+from variant import mi
+
+Rng = np.random.Generator
+TEXTURE_SIDE = 256
+"""Pixels of a texture."""
+
+
+def color(rng: Rng) -> list[float]:
+    """A reflectance: mostly muted, seldom bright and pure."""
+    saturation = rng.beta(1.0, 3.5)
+    return [float(c) for c in colorsys.hsv_to_rgb(rng.random(), saturation, rng.uniform(0.1, 0.9))]
+
+
+def sky(rng: Rng, brightness: float) -> dict:
+    """An environment map: a gradient with clouds, and a sun of one or a few degrees in three of four."""
+    height, width = 256, 512
+    up = np.linspace(1, -1, height)[:, None, None]
+    zenith = np.array([rng.uniform(0.5, 1), rng.uniform(0.7, 1), 1.0]) * rng.uniform(0.4, 1)
+    horizon, ground = np.array([1, rng.uniform(0.8, 1), rng.uniform(0.6, 1)]), np.array(color(rng))
+    image = np.where(up > 0, horizon + (zenith - horizon) * np.sqrt(np.abs(up)), ground) * np.ones((height, width, 1))
+    image *= 0.6 + 0.8 * noise(rng, height, width, 4)[..., None]
+    if rng.random() < 0.75:
+        elevation, azimuth = np.radians(rng.uniform(8, 60)), rng.uniform(0, 2 * np.pi)
+        theta = np.linspace(0, np.pi, height)[:, None]
+        phi = np.linspace(0, 2 * np.pi, width)[None]
+        cosine = np.cos(theta) * np.sin(elevation) + np.sin(theta) * np.cos(elevation) * np.cos(phi - azimuth)
+        radius = np.radians(np.exp(rng.uniform(np.log(1), np.log(5))))
+        sun = (np.arccos(np.clip(cosine, -1, 1)) < radius)[..., None]
+        power = np.exp(rng.uniform(np.log(0.02), np.log(0.5))) / (1 - np.cos(radius))
+        image += sun * power * np.array([1, rng.uniform(0.75, 1), rng.uniform(0.5, 1)])
+    # Mitsuba's maps have y up.
+    to_world = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    return {"type": "envmap", "bitmap": mi.Bitmap((image * brightness * 4).astype(np.float32)), "to_world": to_world}
+
+
+def noise(rng: Rng, height: int, width: int, octaves: int) -> np.ndarray:
+    """Smooth noise in 0..1 that repeats at the edges, `[height, width]`."""
+    total, weight = np.zeros((height, width)), 0.0
+    for octave in range(octaves):
+        cells = 4 << octave
+        grid = rng.random((cells, cells))
+        y, x = (np.arange(n) * cells / n for n in (height, width))
+        y0, x0 = y.astype(int), x.astype(int)
+        fy, fx = ((t - t0) ** 2 * (3 - 2 * (t - t0)) for t, t0 in ((y, y0), (x, x0)))
+        rows = grid[y0] * (1 - fy[:, None]) + grid[(y0 + 1) % cells] * fy[:, None]
+        total += (rows[:, x0] * (1 - fx) + rows[:, (x0 + 1) % cells] * fx) * 0.5**octave
+        weight += 0.5**octave
+    return total / weight
+
+
+def pattern(rng: Rng, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """A texture of two colours, `[256, 256, 3]`."""
+    n = TEXTURE_SIDE
+    y, x = np.mgrid[0:n, 0:n] / n
+    bumps, count = noise(rng, n, n, 5), int(rng.integers(2, 14))
+    kind = rng.integers(6)
+    if kind == 0:
+        share = bumps
+    elif kind == 1:
+        share = ((x * count) % 1 < rng.uniform(0.2, 0.8)).astype(float)
+    elif kind == 2:
+        share = ((np.floor(x * count) + np.floor(y * count)) % 2).astype(float)
+    elif kind == 3:
+        rows = np.floor(y * count)
+        share = (((y * count) % 1 < 0.08) | ((x * count / 2 + 0.5 * rows) % 1 < 0.04)).astype(float)
+    elif kind == 4:
+        share = 0.5 + 0.5 * np.sin(2 * np.pi * (x * count + 2 * bumps + 0.1 * np.sin(2 * np.pi * y)))
+    else:
+        share = (np.hypot((x * count) % 1 - 0.5, (y * count) % 1 - 0.5) < rng.uniform(0.15, 0.45)).astype(float)
+    image = a + (b - a) * share[..., None]
+    return np.clip(image * (0.85 + 0.3 * bumps[..., None] * rng.random()), 0.01, 0.95)
+
+
+def mosaic(rng: Rng, colors: list) -> np.ndarray:
+    """A picture: the nearest of some points says which colour."""
+    n = TEXTURE_SIDE
+    y, x = np.mgrid[0:n, 0:n] / n
+    points = rng.random((rng.integers(4, 40), 2))
+    distance = (x[..., None] - points[:, 0]) ** 2 + (y[..., None] - points[:, 1]) ** 2
+    return np.array(colors)[np.argmin(distance, axis=-1) % len(colors)]

@@ -1,0 +1,162 @@
+"""A path tracer on Mitsuba 3 that returns the twelve feature channels with the colour: normal, position and texture at a path's first
+vertex, texture at its second (Sec. 3.1). Mitsuba's own `aov` integrator has no second vertex.
+
+Emitters and BSDFs are sampled and weighed by the power heuristic; Russian roulette begins at the third vertex.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+from variant import mi
+
+MAX_DEPTH = 8
+"""Vertices of a path, the camera not counted."""
+ROULETTE_DEPTH = 3
+"""Paths may end from this vertex on."""
+LARGEST_WAVEFRONT = 1 << 21
+"""Paths traced at once: some 300 bytes each."""
+FEATURES = ("normal", "position", "albedo1", "albedo2", "mask")
+"""What a path says about its first two vertices, in the order in which `trace` returns it."""
+
+
+@dataclass
+class Samples:
+    """Sums over the samples of each pixel, `[H, W, C]` float64: divide by `count`."""
+
+    color: np.ndarray
+    features: dict[str, np.ndarray]
+    count: int
+
+
+def render(scene: mi.Scene, samples: int, seed: int, clamp: float = np.inf, view: int = 0) -> Samples:
+    """Traces `samples` paths through each pixel of the scene's sensor number `view`: box filter, independent sampler.
+
+    `clamp` bounds what one sample sees beyond emitters in direct view, in the scene's own radiance.
+    """
+    sensor = scene.sensors()[view]
+    width, height = (int(side) for side in sensor.film().crop_size())
+    at_once = max(1, min(samples, LARGEST_WAVEFRONT // (width * height)))
+    sums, done = None, 0
+    while done < samples:
+        count = min(at_once, samples - done)
+        traced = trace_pixels(scene, sensor, width, height, count, seed + done, clamp)
+        sums = traced if sums is None else {name: sums[name] + traced[name] for name in sums}
+        done += count
+    shaped = {name: plane.reshape(height, width, -1) for name, plane in sums.items()}
+    return Samples(shaped.pop("color"), shaped, samples)
+
+
+def trace_pixels(scene, sensor, width: int, height: int, count: int, seed: int, clamp: float) -> dict[str, np.ndarray]:
+    """Sums over `count` paths of each pixel, `[H * W, C]` float64."""
+    paths = width * height * count
+    sampler = mi.load_dict({"type": "independent"})
+    # Mitsuba hashes a seed and an index: neighbours are not correlated.
+    sampler.seed(seed, paths)
+    # Opaque: one kernel for any number of samples.
+    pixel = dr.arange(mi.UInt32, paths) // dr.opaque(mi.UInt32, count)
+    corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
+    film = (corner + sampler.next_2d()) / mi.ScalarPoint2f(width, height)
+    ray, weight = sensor.sample_ray(0.0, sampler.next_1d(), film, sampler.next_2d())
+    color, features = trace(scene, sampler, ray, dr.opaque(mi.Float, min(clamp, 1e30)))
+    color = color * weight
+
+    def per_pixel(*channels: mi.Float) -> np.ndarray:
+        planes = [dr.block_sum(mi.Float(channel) + dr.zeros(mi.Float, paths), count) for channel in channels]
+        dr.eval(planes)
+        return np.stack([plane.numpy() for plane in planes], axis=-1).astype(np.float64)
+
+    buffers = {"color": per_pixel(*color)}
+    for name, value in zip(FEATURES, features):
+        buffers[name] = per_pixel(*value) if name != "mask" else per_pixel(value)
+    return buffers
+
+
+@dr.syntax
+def trace(scene, sampler, ray, clamp):
+    """Radiance and features of each ray: `(Color3f, (normal, position, albedo1, albedo2, mask))`."""
+    context = mi.BSDFContext()
+    ray = mi.Ray3f(ray)
+    radiance, seen, throughput = mi.Color3f(0), mi.Color3f(0), mi.Color3f(1)
+    normal, position, albedo1, albedo2 = mi.Vector3f(0), mi.Vector3f(0), mi.Color3f(0), mi.Color3f(0)
+    mask = mi.Float(0)
+    depth, active = mi.UInt32(0), mi.Bool(True)
+    before = dr.zeros(mi.SurfaceInteraction3f)
+    before_pdf, before_delta, eta = mi.Float(1), mi.Bool(True), mi.Float(1)
+
+    while dr.hint(active, max_iterations=MAX_DEPTH + 1, label="path"):
+        si = scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=(depth == 0))
+        bsdf = si.bsdf(ray)
+        emitter = si.emitter(scene)
+
+        # What the vertex itself emits, weighed against having sampled it as a light.
+        direction = mi.DirectionSample3f(scene, si, before)
+        light_pdf = mi.Float(0)
+        if ~before_delta:
+            light_pdf = scene.pdf_emitter_direction(before, direction, ~before_delta)
+        emitted = throughput * emitter.eval(si, active) * power(before_pdf, light_pdf)
+        seen = dr.select(depth == 0, emitted, seen)
+        radiance = dr.select(depth == 0, radiance, radiance + emitted)
+
+        going_on = active & (depth + 1 < MAX_DEPTH) & si.is_valid()
+        flags = bsdf.flags()
+        smooth = going_on & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+
+        # One light sample.
+        light, light_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, smooth)
+        smooth &= light.pdf != 0
+        towards = si.to_local(light.d)
+        value, pdf, sample, sample_weight = bsdf.eval_pdf_sample(
+            context, si, towards, sampler.next_1d(going_on), sampler.next_2d(going_on)
+        )
+        light_mis = dr.select(light.delta, 1, power(light.pdf, pdf))
+        radiance = dr.select(smooth, radiance + throughput * si.to_world_mueller(value, -towards, si.wi) * light_weight * light_mis, radiance)
+
+        # Features of the first two vertices.
+        if active & (depth < 2):
+            texture = albedo(bsdf, si, sample_weight, emitter, active)
+            first = depth == 0
+            hit = first & si.is_valid()
+            facing = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
+            normal = dr.select(hit, facing, normal)
+            position = dr.select(hit, si.p, position)
+            mask = dr.select(hit, 1, mask)
+            albedo1 = dr.select(first, texture, albedo1)
+            albedo2 = dr.select(first, albedo2, texture)
+
+        # The next direction.
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        throughput *= sample_weight
+        eta *= sample.eta
+        before, before_pdf = si, sample.pdf
+        before_delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+
+        strongest = dr.max(throughput) * eta * eta
+        survival = dr.minimum(strongest, 0.95)
+        roulette = depth + 1 >= ROULETTE_DEPTH
+        throughput[roulette] = throughput * dr.rcp(dr.maximum(survival, 1e-6))
+        active = going_on & (strongest > 0) & (~roulette | (sampler.next_1d() < survival))
+        depth += 1
+
+    finite = dr.isfinite(mi.luminance(radiance))
+    radiance = dr.select(finite, radiance, 0)
+    # Brightness is bounded, the hue is kept.
+    radiance *= dr.minimum(1, clamp / dr.maximum(dr.max(radiance), 1e-12))
+    return radiance + seen, (normal, position, albedo1, albedo2, mask)
+
+
+def power(a: mi.Float, b: mi.Float) -> mi.Float:
+    """The power heuristic's weight of the technique with density `a`."""
+    a, b = a * a, b * b
+    return dr.select(a > 0, a / (a + b), 0)
+
+
+def albedo(bsdf, si, sample_weight, emitter, active):
+    """Diffuse reflectance where there is one, else the specular tint; emitters and sky: what they emit, at most 1."""
+    diffuse = bsdf.eval_diffuse_reflectance(si, active)
+    tint = dr.clip(sample_weight, 0, 1)
+    surface = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse), diffuse, tint)
+    surface = dr.select(si.is_valid(), surface, 0)
+    return dr.minimum(1, surface + emitter.eval(si, active))

@@ -1,0 +1,127 @@
+"""One view as training needs it: a noisy image with its features, a reference from other samples, and how noisy both are."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import tracer
+
+LUMINANCE = 0.22
+"""What the mean luminance is scaled to, without the brightest pixels."""
+TRIMMED = 0.02
+"""Share of the pixels that are the brightest."""
+CLAMP = 45.0
+"""What a sample may bring at most, in units of that mean."""
+PROBE_SAMPLES = 8
+"""Samples a pixel that the mean is taken from."""
+PASS_SAMPLES = 16
+"""Samples a pixel of one pass of the reference; passes go to two halves in turn."""
+EPSILON = 0.001
+"""Eq. 5."""
+CHANNELS = {"normal.": "XYZ", "position.": "XYZ", "albedo1.": "RGB", "albedo2.": "RGB", "mask.": "A"}
+
+
+class Unsuitable(Exception):
+    """Nothing can be learnt from the view."""
+
+
+@dataclass
+class Budget:
+    """What a view may cost."""
+
+    samples: int
+    """Of the noisy image."""
+    ref_samples: int
+    """Of the reference, at most."""
+    residual: float
+    """RelMSE of the reference against a perfect one that is enough."""
+    noise: tuple[float, float] = (0.0, np.inf)
+    """RelMSE of the noisy image, least and most."""
+    near: float = 0.0
+    """A view with more than three of ten pixels nearer than this looks at a wall."""
+
+
+def photograph(scene, view: int, seed: int, budget: Budget) -> tuple[dict[str, np.ndarray], dict]:
+    """Channels of the EXR file, `[H, W]` each, and what is said about them in the manifest."""
+    probe = tracer.render(scene, PROBE_SAMPLES, seed, view=view)
+    luminance = np.sort((probe.color / probe.count @ [0.2126, 0.7152, 0.0722]).ravel())
+    mean = luminance[: int(len(luminance) * (1 - TRIMMED))].mean()
+    if not mean > 1e-4:
+        raise Unsuitable("dark")
+    eye = np.ravel(scene.sensors()[view].world_transform().translation())
+    distance = np.linalg.norm(probe.features["position"] / probe.count - eye, axis=-1)
+    if np.quantile(distance, 0.3) < budget.near:
+        raise Unsuitable("blocked")
+    scale, clamp = LUMINANCE / mean, CLAMP * mean
+
+    noisy = tracer.render(scene, budget.samples, seed + 10, clamp, view)
+    color = noisy.color / noisy.count * scale
+    halves, count = [0.0, 0.0], 0
+    while True:
+        for half in range(2):
+            traced = tracer.render(scene, PASS_SAMPLES, seed + 100 + count + PASS_SAMPLES * half, clamp, view)
+            halves[half] = halves[half] + traced.color / traced.count
+        count += 2 * PASS_SAMPLES
+        a, b = (half / (count / (2 * PASS_SAMPLES)) * scale for half in halves)
+        reference = (a + b) / 2
+        residual = rel_mse((a - b) / 2, reference)
+        noise = rel_mse(color - reference, reference) - residual
+        if not budget.noise[0] < noise < budget.noise[1]:
+            raise Unsuitable(f"noise {noise:.1f}")
+        if residual < budget.residual or count >= budget.ref_samples:
+            break
+
+    buffers = {"": ("RGB", color), "ref.": ("RGB", reference)}
+    for (prefix, names), name in zip(CHANNELS.items(), tracer.FEATURES):
+        buffers[prefix] = (names, noisy.features[name] / noisy.count)
+    channels = {}
+    for prefix, (names, planes) in buffers.items():
+        kind = np.float32 if prefix == "position." and too_coarse(planes) else np.float16
+        limit = np.finfo(kind).max
+        for i, name in enumerate(names):
+            channels[prefix + name] = np.ascontiguousarray(planes[..., i].clip(-limit, limit).astype(kind))
+    height, width, _ = color.shape
+    facts = {
+        "width": width,
+        "height": height,
+        "spp": noisy.count,
+        "ref_spp": count,
+        "seed": seed,
+        "max_depth": tracer.MAX_DEPTH,
+        "exposure_scale": float(scale),
+        "clamp_value": CLAMP * LUMINANCE,
+        "noisy_relmse": noise,
+        "ref_residual_relmse": residual,
+        "mask_mean": float(noisy.features["mask"].mean() / noisy.count),
+    }
+    return channels, facts
+
+
+def rel_mse(difference: np.ndarray, reference: np.ndarray) -> float:
+    """Eq. 5, summed over rgb."""
+    return float((difference**2 / (reference**2 + EPSILON)).mean() * 3)
+
+
+def too_coarse(position: np.ndarray) -> bool:
+    """Whether a half's step is more than a thousandth of what is seen."""
+    step = float(np.spacing(np.float16(min(np.abs(position).max(), 6e4))))
+    return np.abs(position).max() > 6e4 or step > np.ptp(position, axis=(0, 1)).max() / 1000
+
+
+def write(path: Path, channels: dict[str, np.ndarray], entry: dict) -> None:
+    """The EXR file, whole or not at all. Its header repeats the manifest's entry."""
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "demc": json.dumps(entry)}
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    OpenEXR.File(header, channels).write(str(unfinished))
+    os.replace(unfinished, path)
+
+
+def entry_of(path: Path) -> dict:
+    """What a file's header repeats."""
+    with OpenEXR.File(str(path), header_only=True) as file:
+        return json.loads(file.header()["demc"])

@@ -1,0 +1,116 @@
+"""`render/`, the path tracer that makes training data, beside Mitsuba's own integrators.
+
+Skipped without what it needs (mitsuba, LLVM, OpenEXR), unless DEMC_REQUIRE_MITSUBA=1.
+"""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import unittest
+from pathlib import Path
+
+FOLDER = Path(__file__).resolve().parents[1] / "render"
+MISSING = [name for name in ("numpy", "OpenEXR", "mitsuba") if importlib.util.find_spec(name) is None]
+SIDE, SAMPLES = 32, 1024
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, FOLDER, *map(str, arguments)], capture_output=True, text=True)
+
+
+@unittest.skipIf(MISSING and os.environ.get("DEMC_REQUIRE_MITSUBA") != "1", f"no {', '.join(MISSING)}")
+class Render(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls) -> None:
+        sys.path.insert(0, str(FOLDER))
+        cls.addClassCleanup(sys.path.remove, str(FOLDER))
+
+    def scene(self) -> dict:
+        """A box with a light, a wall of plastic and a ball of metal."""
+        from variant import mi
+
+        scene = mi.cornell_box()
+        film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+        scene["sensor"]["film"] = film | {"component_format": "float32"}
+        scene["back"]["bsdf"] = {"type": "roughplastic", "diffuse_reflectance": {"type": "rgb", "value": [0.3, 0.5, 0.1]}}
+        ball = {"type": "sphere", "center": [0.4, -0.5, 0.5], "radius": 0.3, "bsdf": {"type": "roughconductor", "material": "Cu"}}
+        return scene | {"ball": ball}
+
+    def test_radiance_is_that_of_mitsubas_path_integrator(self) -> None:
+        import numpy as np
+        import tracer
+        from variant import mi
+
+        scene = mi.load_dict(self.scene())
+        path = mi.load_dict({"type": "path", "max_depth": tracer.MAX_DEPTH, "rr_depth": 100})
+        theirs = np.array(mi.render(scene, integrator=path, spp=SAMPLES, seed=7))
+        halves = [tracer.render(scene, SAMPLES // 2, seed) for seed in (1000, 2000)]
+        a, b = (half.color / half.count for half in halves)
+        ours, noise = (a + b) / 2, np.abs(a - b).mean() / 2
+        np.testing.assert_allclose(ours.mean((0, 1)), theirs.mean((0, 1)), rtol=0.01)
+        # Two images as noisy as each other differ by sqrt(2) of what one has.
+        self.assertLess(np.abs(ours - theirs).mean(), 2 * noise)
+
+    def test_features_are_those_of_mitsubas_aov_integrator(self) -> None:
+        import numpy as np
+        import tracer
+        from variant import mi
+
+        scene = mi.load_dict(self.scene())
+        aovs = {"type": "aov", "aovs": "a:albedo,n:sh_normal,p:position"}
+        theirs = np.array(mi.render(scene, integrator=mi.load_dict(aovs), spp=SAMPLES, seed=7))
+        ours = tracer.render(scene, SAMPLES, 1000)
+        albedo, normal, position = (ours.features[name] / ours.count for name in ("albedo1", "normal", "position"))
+        np.testing.assert_allclose(np.abs(normal).mean((0, 1)), np.abs(theirs[..., 3:6]).mean((0, 1)), atol=0.01)
+        np.testing.assert_allclose(position.mean((0, 1)), theirs[..., 6:9].mean((0, 1)), atol=0.01)
+        # Mitsuba's albedo knows no light that is seen and takes plastic and metal whole: the left wall is diffuse.
+        wall = np.s_[8:24, 1:4]
+        np.testing.assert_allclose(albedo[wall], theirs[wall][..., :3], atol=0.02)
+        # What is hit second is not what is hit first.
+        self.assertGreater(np.abs(ours.features["albedo2"] / ours.count - albedo).mean(), 0.05)
+
+    def test_a_clamp_leaves_lights_alone_and_bounds_the_rest(self) -> None:
+        import numpy as np
+        import tracer
+        from variant import mi
+
+        scene = mi.load_dict(self.scene())
+        free, bounded = (tracer.render(scene, 16, 1000, clamp) for clamp in (np.inf, 0.1))
+        lit = free.features["albedo1"].min(-1) / free.count > 0.999
+        self.assertGreaterEqual(lit.sum(), 4)
+        np.testing.assert_allclose(bounded.color[lit], free.color[lit], atol=0.11 * free.count)
+        self.assertLess((bounded.color[~lit] / free.count).max(), 1.5)
+        self.assertLess(bounded.color[~lit].mean(), 0.7 * free.color[~lit].mean())
+
+    def test_a_data_set_is_the_same_for_one_seed_and_goes_on_where_it_stopped(self) -> None:
+        import numpy as np
+        import views
+
+        with tempfile.TemporaryDirectory() as folder:
+            ask = ("--rooms", 1, "--views", 2, "--size", 32, "--ref-spp", 32)
+            first, second = Path(folder) / "first", Path(folder) / "second"
+            for out in (first, second):
+                ended = run("-o", out, *ask)
+                self.assertEqual(ended.returncode, 0, ended.stderr)
+            manifest = json.loads((first / "manifest.json").read_text())
+            self.assertEqual(manifest, json.loads((second / "manifest.json").read_text()))
+            scenes = manifest["scenes"]
+            self.assertEqual(len(scenes) + len(manifest["left_out"]), 2)
+            self.assertTrue(scenes)
+            for scene in scenes:
+                files = [(out / scene["file"]).read_bytes() for out in (first, second)]
+                self.assertEqual(*files)
+                self.assertEqual(views.entry_of(first / scene["file"]), scene)
+            again = run("-o", first, *ask, "--with", second)
+            self.assertEqual((again.returncode, again.stdout), (0, ""), again.stderr)
+            both = json.loads((first / "manifest.json").read_text())["scenes"]
+            self.assertEqual([scene["file"] for scene in both[len(scenes) :]], [f"../second/{scene['file']}" for scene in scenes])
+
+    def test_nothing_to_render_is_said(self) -> None:
+        with tempfile.TemporaryDirectory() as empty:
+            ended = run("-o", empty)
+        self.assertEqual(ended.returncode, 2)
+        self.assertIn("nothing to render", ended.stderr)
