@@ -12,7 +12,7 @@ use super::Image;
 use super::color::{
     Color, hunt_lab_from_linear, hyab, linear_from_opponent, linear_from_srgb, opponent_from_linear,
 };
-use super::filter::{Edge, separable};
+use super::filter::separable;
 
 /// Pixels a degree of the viewer's angle: 0.7 m from a monitor that is 0.7 m and 3840 pixels wide (the paper's).
 const PIXELS_PER_DEGREE: f32 = 0.7 * 3840.0 / 0.7 * (PI / 180.0);
@@ -124,7 +124,7 @@ fn sensitivity(plane: &[f32], width: usize, gaussians: [(f32, f32); 2]) -> Vec<f
         .sum();
     let mut out = vec![0.0; plane.len()];
     for (weight, taps) in weighted.iter().filter(|(weight, _)| *weight > 0.0) {
-        let part = separable(plane, width, taps, taps, Edge::Replicate);
+        let part = separable(plane, width, taps, taps);
         for (out, part) in out.iter_mut().zip(part) {
             *out += weight / total * part;
         }
@@ -154,8 +154,8 @@ fn features(grey: &[f32], width: usize) -> Vec<[f32; 2]> {
     };
     let blur = taps(|_| 1.0);
     let strength = |derivative: Vec<f32>| -> Vec<f32> {
-        let x = separable(grey, width, &derivative, &blur, Edge::Replicate);
-        let y = separable(grey, width, &blur, &derivative, Edge::Replicate);
+        let x = separable(grey, width, &derivative, &blur);
+        let y = separable(grey, width, &blur, &derivative);
         x.iter().zip(y).map(|(x, y)| x.hypot(y)).collect()
     };
     let (edges, points) = (strength(taps(|x| -x)), strength(taps(|x| x * x - 1.0)));

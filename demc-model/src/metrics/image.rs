@@ -6,7 +6,6 @@ use rayon::prelude::*;
 
 use super::DISPLAY_GAMMA;
 use super::flip::Appearance;
-use super::perceptual::Moments;
 
 /// Why an image cannot be measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -28,7 +27,6 @@ pub struct Image<'a> {
     width: usize,
     display: OnceLock<Vec<f64>>,
     appearance: OnceLock<Appearance>,
-    moments: OnceLock<Vec<Moments>>,
 }
 
 impl<'a> Image<'a> {
@@ -58,7 +56,6 @@ impl<'a> Image<'a> {
             width,
             display: OnceLock::new(),
             appearance: OnceLock::new(),
-            moments: OnceLock::new(),
         })
     }
 
@@ -96,11 +93,6 @@ impl<'a> Image<'a> {
         once(&self.appearance, || {
             Appearance::new(self.display(), self.width)
         })
-    }
-
-    /// What SSIM compares, channel by channel, of an image that is larger than its window.
-    pub(super) fn moments(&self) -> &[Moments] {
-        once::<Vec<Moments>>(&self.moments, || Moments::new(self.display(), self.width))
     }
 
     /// Fails a programmer who compares images of two sizes.

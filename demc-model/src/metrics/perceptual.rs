@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::Image;
-use super::filter::{Edge, separable};
+use super::filter::add;
 
 /// Side of SSIM's Gaussian window, px.
 pub const SSIM_WINDOW: usize = 11;
@@ -21,11 +21,11 @@ pub fn ssim(candidate: &Image, reference: &Image) -> Option<f64> {
     if height < SSIM_WINDOW || width < SSIM_WINDOW {
         return None;
     }
-    let channels = (0..3).into_par_iter();
-    let of_channels: Vec<f64> = channels
-        .map(|channel| ssim_plane(candidate, reference, channel))
-        .collect();
-    Some(of_channels.iter().sum::<f64>() / 3.0)
+    let pixels = height * width;
+    let channels = candidate.display().chunks(pixels);
+    let channels = channels.zip(reference.display().chunks(pixels));
+    let sum: f64 = channels.map(|(c, r)| ssim_plane(c, r, width)).sum();
+    Some(sum / 3.0)
 }
 
 /// `psnr` in dB; `None` for images that are displayed alike, which would be infinite.
@@ -43,51 +43,63 @@ pub fn psnr(candidate: &Image, reference: &Image) -> Option<f64> {
     (sum > 0.0).then(|| -10.0 * (sum / reference.display().len() as f64).log10())
 }
 
-/// What SSIM needs of one image's channel in all windows that lie inside: Gaussian means of the values and of their squares.
-pub(super) struct Moments {
-    mean: Vec<f64>,
-    square: Vec<f64>,
+/// What SSIM averages over a window: x, y, x^2, y^2 and xy.
+const MOMENTS: usize = 5;
+
+/// Mean over all windows that lie inside, of one channel. Row by row: nothing of the size of the image is stored.
+fn ssim_plane(x: &[f64], y: &[f64], width: usize) -> f64 {
+    let taps = gaussian();
+    let rows = x.len() / width + 1 - SSIM_WINDOW;
+    let inner = width + 1 - SSIM_WINDOW;
+    let buffers = || {
+        let of = |len: usize| [(); MOMENTS].map(|()| vec![0.0; len]);
+        (of(width), of(inner))
+    };
+    let of_rows: Vec<f64> = (0..rows)
+        .into_par_iter()
+        .map_init(buffers, |(down, across), row| {
+            down.iter_mut().for_each(|moment| moment.fill(0.0));
+            for (k, &tap) in taps.iter().enumerate() {
+                let line = (row + k) * width..(row + k + 1) * width;
+                add_moments(down, &x[line.clone()], &y[line], tap);
+            }
+            for (across, down) in across.iter_mut().zip(&*down) {
+                across.fill(0.0);
+                for (k, &tap) in taps.iter().enumerate() {
+                    add(across, &down[k..k + inner], tap);
+                }
+            }
+            ssim_row(across)
+        })
+        .collect();
+    // Added in order: the same number on any number of threads.
+    of_rows.iter().sum::<f64>() / (rows * inner) as f64
 }
 
-impl Moments {
-    /// Of each channel of an image as it is displayed, planar `[3, H, width]`, larger than the window.
-    pub(super) fn new(display: &[f64], width: usize) -> Vec<Self> {
-        let channels = display.par_chunks(display.len() / 3);
-        let moments = channels.map(|plane| Self {
-            mean: blur(plane, width),
-            square: blur(&product(plane, plane), width),
-        });
-        moments.collect()
+fn add_moments(sums: &mut [Vec<f64>; MOMENTS], x: &[f64], y: &[f64], tap: f64) {
+    let [mean_x, mean_y, xx, yy, xy] = sums;
+    let means = mean_x.iter_mut().zip(mean_y);
+    let squares = xx.iter_mut().zip(yy).zip(xy);
+    for (((mx, my), ((xx, yy), xy)), (&x, &y)) in means.zip(squares).zip(x.iter().zip(y)) {
+        let (tx, ty) = (tap * x, tap * y);
+        *mx += tx;
+        *my += ty;
+        *xx += tx * x;
+        *yy += ty * y;
+        *xy += tx * y;
     }
 }
 
-/// Mean over all windows that lie inside, of one channel.
-fn ssim_plane(candidate: &Image, reference: &Image, channel: usize) -> f64 {
+/// Sum over a row of windows.
+fn ssim_row([mean_x, mean_y, xx, yy, xy]: &[Vec<f64>; MOMENTS]) -> f64 {
     const C1: f64 = 0.01 * 0.01;
     const C2: f64 = 0.03 * 0.03;
-    let (height, width) = candidate.size();
-    let plane = channel * height * width..(channel + 1) * height * width;
-    let display = [candidate, reference].map(|image| &image.display()[plane.clone()]);
-    let xy = blur(&product(display[0], display[1]), width);
-    let (x, y) = (&candidate.moments()[channel], &reference.moments()[channel]);
-    let sum: f64 = (0..xy.len())
-        .map(|i| {
-            let (mx, my) = (x.mean[i], y.mean[i]);
-            let (vx, vy) = (x.square[i] - mx * mx, y.square[i] - my * my);
-            let cov = xy[i] - mx * my;
-            ((2.0 * mx * my + C1) * (2.0 * cov + C2)) / ((mx * mx + my * my + C1) * (vx + vy + C2))
-        })
-        .sum();
-    sum / xy.len() as f64
-}
-
-fn product(a: &[f64], b: &[f64]) -> Vec<f64> {
-    a.iter().zip(b).map(|(a, b)| a * b).collect()
-}
-
-fn blur(plane: &[f64], width: usize) -> Vec<f64> {
-    let taps = gaussian();
-    separable(plane, width, &taps, &taps, Edge::Valid)
+    let window = |i: usize| {
+        let (mx, my) = (mean_x[i], mean_y[i]);
+        let (vx, vy, cov) = (xx[i] - mx * mx, yy[i] - my * my, xy[i] - mx * my);
+        ((2.0 * mx * my + C1) * (2.0 * cov + C2)) / ((mx * mx + my * my + C1) * (vx + vy + C2))
+    };
+    (0..mean_x.len()).map(window).sum()
 }
 
 fn gaussian() -> [f64; SSIM_WINDOW] {
