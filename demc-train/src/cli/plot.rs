@@ -9,7 +9,7 @@ use demc_train::progress::say;
 
 /// Draw loss and validation curves of one or many runs to SVG and PNG
 ///
-/// Three panels over the steps: training loss (smoothed, the raw values pale beneath), validation RelMSE and validation SSIM.
+/// Panels over the steps: training loss (smoothed, the raw values pale beneath), and validation RelMSE and SSIM where a run has any.
 /// A run that is still going can be drawn at any time.
 #[derive(Debug, Args)]
 pub struct Arguments {
