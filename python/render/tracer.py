@@ -63,15 +63,14 @@ def trace_pixels(scene, sensor, width: int, height: int, count: int, seed: int, 
     color, features = trace(scene, sampler, ray, dr.opaque(mi.Float, min(clamp, 1e30)))
     color = color * weight
 
-    def per_pixel(*channels: mi.Float) -> np.ndarray:
-        planes = [dr.block_sum(mi.Float(channel) + dr.zeros(mi.Float, paths), count) for channel in channels]
-        dr.eval(planes)
-        return np.stack([plane.numpy() for plane in planes], axis=-1).astype(np.float64)
-
-    buffers = {"color": per_pixel(*color)}
+    channels = {"color": [*color]}
     for name, value in zip(FEATURES, features):
-        buffers[name] = per_pixel(*value) if name != "mask" else per_pixel(value)
-    return buffers
+        channels[name] = [*value] if name != "mask" else [value]
+    channels = {name: [mi.Float(plane) + dr.zeros(mi.Float, paths) for plane in planes] for name, planes in channels.items()}
+    # All at once: a sum evaluates what it sums, and sixteen of them would trace each path sixteen times.
+    dr.eval(channels)
+    sums = {name: [dr.block_sum(plane, count).numpy() for plane in planes] for name, planes in channels.items()}
+    return {name: np.stack(planes, axis=-1).astype(np.float64) for name, planes in sums.items()}
 
 
 @dr.syntax

@@ -46,7 +46,7 @@ impl Evaluate {
     /// Scores every scene of the split.
     pub fn run(self) -> anyhow::Result<()> {
         let more = chosen(&self.metrics)?;
-        let report = self.scenes.score(|_, _| Ok(()))?;
+        let report = self.scenes.score(|_, _| Ok(()), |(), _| Ok(()))?;
         // The table first: it is not lost where the file cannot be written.
         if self.json.as_deref() != Some(Path::new("-")) {
             let headlines = METRICS[..2].iter().map(|metric| metric.name);

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use clap::Args;
-use demc_infer::report::{About, Page, Views};
+use demc_infer::report::{About, Page};
 
 use super::scenes::Scenes;
 
@@ -29,14 +29,10 @@ impl Report {
     /// Scores every scene of the split and writes the page, whole or not at all.
     pub fn run(self) -> anyhow::Result<()> {
         let mut page = Page::default();
-        let report = self.scenes.score(|scored, scenes| {
-            let views = Views {
-                frame: scored.frame,
-                denoised: scored.denoised,
-                baselines: scored.baselines,
-            };
-            Ok(page.add(&views, scored.score, scenes)?)
-        })?;
+        let report = self.scenes.score(
+            |views, scenes| Ok(views.encode(scenes)?),
+            |encoded, score| Ok(page.add(encoded, score)?),
+        )?;
         let about = About {
             model: self.scenes.model_name(),
             data: self.scenes.data.display().to_string(),

@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use demc_data::{Dataset, Frame, Rgb, Scene};
+use demc_data::{Dataset, Rgb, Scene};
+use demc_infer::report::Views;
 use demc_infer::{Baseline, BaselineError, ImageScore, Report, baseline};
 
 use super::{Clamped, DeviceFlag, Model, Usage};
@@ -44,14 +45,6 @@ impl From<Split> for demc_data::Split {
     }
 }
 
-/// A scene and all images of it.
-pub struct Scored<'a> {
-    pub frame: &'a Frame,
-    pub denoised: &'a [f32],
-    pub baselines: &'a [(&'a str, &'a [f32])],
-    pub score: &'a ImageScore,
-}
-
 impl Scenes {
     /// What computes the denoised images, for a title.
     pub fn model_name(&self) -> String {
@@ -63,11 +56,12 @@ impl Scenes {
             })
     }
 
-    /// Scores every scene of the split in all metrics, one in memory at a time, and shows it to `each` with the number of
-    /// all. The first that fails ends it: a mean over fewer would mislead.
-    pub fn score(
+    /// Scores every scene of the split in all metrics, one in memory at a time. `beside` sees its images and the number of all
+    /// scenes while they are scored, and `each` gets what that made. The first that fails ends it: a mean over fewer would mislead.
+    pub fn score<T: Send>(
         &self,
-        mut each: impl FnMut(Scored, usize) -> anyhow::Result<()>,
+        beside: impl Fn(&Views, usize) -> anyhow::Result<T> + Sync,
+        mut each: impl FnMut(T, &ImageScore) -> anyhow::Result<()>,
     ) -> anyhow::Result<Report> {
         let bundle = self.model.load_onto(&self.device)?;
         let layout = &bundle.meta.layout;
@@ -94,14 +88,17 @@ impl Scenes {
                 .collect();
             let denoised = bundle.denoise(&frame)?;
             let residual = scene.ref_residual_relmse;
-            let score = ImageScore::full(&frame, &denoised, &others, residual)?;
-            let scored = Scored {
+            let views = Views {
                 frame: &frame,
                 denoised: &denoised,
                 baselines: &others,
-                score: &score,
             };
-            each(scored, scenes.len())?;
+            let (score, made) = rayon::join(
+                || ImageScore::full(&frame, &denoised, &others, residual),
+                || beside(&views, scenes.len()),
+            );
+            let score = score?;
+            each(made?, &score)?;
             images.push(score);
             progress.advance();
         }

@@ -146,20 +146,9 @@ impl ImageScore {
         reference_residual: Option<f64>,
         score: fn(&Image, &Image) -> Score,
     ) -> Result<Self, DenoiseError> {
-        let image = |what: &str, planes| {
-            Image::new(planes, frame.height, frame.width).map_err(|source| DenoiseError::Image {
-                name: frame.name.clone(),
-                what: what.to_owned(),
-                source,
-            })
-        };
-        let reference = frame.reference.as_deref();
-        let reference = reference.ok_or_else(|| DenoiseError::NoReference {
-            name: frame.name.clone(),
-        })?;
-        let zeros = vec![0.0; reference.len()];
-        let reference = image("reference", reference)?;
-        let score = |what: &str, planes| Ok(score(&image(what, planes)?, &reference));
+        let reference = reference_of(frame)?;
+        let zeros = vec![0.0; reference.hdr().len()];
+        let score = |what, planes| Ok(score(&image_of(frame, what, planes)?, &reference));
         let baselines = baselines
             .iter()
             .map(|(name, planes)| Ok(((*name).to_owned(), score(name, planes)?)));
@@ -191,6 +180,28 @@ fn methods<'a>(
         .chain(baselines)
         .chain([("denoised", denoised)])
         .collect()
+}
+
+/// An image of `frame` that can be measured.
+pub(crate) fn image_of<'a>(
+    frame: &Frame,
+    what: &str,
+    planes: &'a [f32],
+) -> Result<Image<'a>, DenoiseError> {
+    Image::new(planes, frame.height, frame.width).map_err(|source| DenoiseError::Image {
+        name: frame.name.clone(),
+        what: what.to_owned(),
+        source,
+    })
+}
+
+/// The reference of `frame`.
+pub(crate) fn reference_of(frame: &Frame) -> Result<Image<'_>, DenoiseError> {
+    let no_reference = || DenoiseError::NoReference {
+        name: frame.name.clone(),
+    };
+    let planes = frame.reference.as_deref().ok_or_else(no_reference)?;
+    image_of(frame, "reference", planes)
 }
 
 /// Denoises `frame` and takes its headline scores: one image in memory at a time.

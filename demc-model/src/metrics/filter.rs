@@ -2,6 +2,7 @@
 
 use std::ops::{AddAssign, Mul};
 
+use multiversion::multiversion;
 use rayon::prelude::*;
 
 /// Correlates the columns of `plane` with `down`, then its rows with `across`, both of odd length. Outside of the plane lies the
@@ -35,7 +36,8 @@ pub(super) fn separable(plane: &[f32], width: usize, across: &[f32], down: &[f32
     out
 }
 
-/// `out += tap * values`.
+/// `out += tap * values`. The same bits with any instructions: products and sums are rounded one by one.
+#[multiversion(targets("x86_64+avx512f", "x86_64+avx2"))]
 pub(super) fn add<T: Copy + AddAssign + Mul<Output = T>>(out: &mut [T], values: &[T], tap: T) {
     for (out, &value) in out.iter_mut().zip(values) {
         *out += tap * value;

@@ -1,5 +1,6 @@
 //! SSIM (Wang et al. 2004) and PSNR, on `clip(x, 0, 1)^(1 / 2.2)` with a data range of 1.
 
+use multiversion::multiversion;
 use rayon::prelude::*;
 
 use super::Image;
@@ -76,6 +77,7 @@ fn ssim_plane(x: &[f64], y: &[f64], width: usize) -> f64 {
     of_rows.iter().sum::<f64>() / (rows * inner) as f64
 }
 
+#[multiversion(targets("x86_64+avx512f", "x86_64+avx2"))]
 fn add_moments(sums: &mut [Vec<f64>; MOMENTS], x: &[f64], y: &[f64], tap: f64) {
     let [mean_x, mean_y, xx, yy, xy] = sums;
     let means = mean_x.iter_mut().zip(mean_y);
@@ -91,6 +93,7 @@ fn add_moments(sums: &mut [Vec<f64>; MOMENTS], x: &[f64], y: &[f64], tap: f64) {
 }
 
 /// Sum over a row of windows.
+#[multiversion(targets("x86_64+avx512f", "x86_64+avx2"))]
 fn ssim_row([mean_x, mean_y, xx, yy, xy]: &[Vec<f64>; MOMENTS]) -> f64 {
     const C1: f64 = 0.01 * 0.01;
     const C2: f64 = 0.03 * 0.03;
