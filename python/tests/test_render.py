@@ -72,6 +72,19 @@ class Render(unittest.TestCase):
         # What is hit second is not what is hit first.
         self.assertGreater(np.abs(ours.features["albedo2"] / ours.count - albedo).mean(), 0.05)
 
+    def test_a_path_is_traced_once_for_all_channels(self) -> None:
+        import drjit as dr
+        import tracer
+        from variant import mi
+
+        scene = mi.load_dict(self.scene())
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            tracer.render(scene, 4, 1000)
+            operations = sorted(kernel.get("operation_count", 0) for kernel in dr.kernel_history())
+        self.assertGreater(operations[-1], 1000)
+        self.assertLess(sum(operations[:-1]), operations[-1] / 2)
+
     def test_a_clamp_leaves_lights_alone_and_bounds_the_rest(self) -> None:
         import numpy as np
         import tracer
