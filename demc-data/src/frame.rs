@@ -8,7 +8,7 @@ use crate::Error;
 use crate::channel::Window;
 use crate::exr::ExrFile;
 use crate::layout::{ChannelLayout, Missing, Triple};
-use crate::parallel::{self, processors};
+use crate::parallel;
 use crate::plane::Plane;
 
 /// Number of feature channels: normal xyz, position xyz, texture RGB at the first and at the second vertex
@@ -325,7 +325,7 @@ fn planar(planes: &[Plane]) -> Vec<f32> {
     let pixels = planes.first().map_or(0, Plane::len);
     let mut samples = vec![0.0; planes.len() * pixels];
     let parts = samples.chunks_exact_mut(pixels.max(1)).zip(planes);
-    parallel::map(processors(), parts.collect(), |(part, plane)| {
+    parallel::map(parallel::available(), parts.collect(), |(part, plane)| {
         plane.copy_to(0, part)
     });
     samples

@@ -1,15 +1,28 @@
 //! Work on many items at once, on threads of its own: those of a pool may be waiting for the thread that asks, as the
 //! ones that train do for their loader.
 
+use std::env;
 use std::num::NonZero;
 use std::panic::resume_unwind;
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::thread::{self, Builder};
 
-/// How many processors there are for this process.
-pub(crate) fn processors() -> usize {
-    static PROCESSORS: OnceLock<usize> = OnceLock::new();
-    *PROCESSORS.get_or_init(|| thread::available_parallelism().map_or(1, NonZero::get))
+/// The variable that bounds rayon's pool bounds these threads, too.
+const LIMIT: &str = "RAYON_NUM_THREADS";
+
+/// How many threads to use: what [`LIMIT`] says, or as many as there are processors for this process.
+pub(crate) fn available() -> usize {
+    static AVAILABLE: OnceLock<usize> = OnceLock::new();
+    *AVAILABLE.get_or_init(|| {
+        let processors = thread::available_parallelism().map_or(1, NonZero::get);
+        limited(env::var(LIMIT).ok().as_deref(), processors)
+    })
+}
+
+/// As rayon reads the variable: 0 and what is no number say nothing.
+fn limited(variable: Option<&str>, processors: usize) -> usize {
+    let asked = variable.and_then(|value| value.parse().ok());
+    asked.filter(|threads| *threads > 0).unwrap_or(processors)
 }
 
 /// What `work` makes of each item, in their order, on so many threads, this one among them. Where the system has no more
@@ -61,6 +74,14 @@ mod tests {
                 assert_eq!(tripled, expected, "{threads} threads");
             }
         }
+    }
+
+    #[test]
+    fn the_variable_of_rayon_counts_here_too() {
+        for (variable, threads) in [("1", 1), ("3", 3), ("0", 8), ("", 8), ("two", 8)] {
+            assert_eq!(limited(Some(variable), 8), threads, "{variable:?}");
+        }
+        assert_eq!(limited(None, 8), 8);
     }
 
     #[test]

@@ -4,7 +4,7 @@
 
 use crate::dataset::size_mismatch;
 use crate::frame::{FEATURES, FramePlanes, Presence};
-use crate::parallel::{self, processors};
+use crate::parallel;
 use crate::plane::Plane;
 use crate::ranges::{Ranges, Summary};
 use crate::transform::STD_FLOOR;
@@ -40,7 +40,12 @@ impl Statistics {
     /// The first scene's error that cannot be used, as in [`crate::read_frame`]; a reference that `layout`
     /// names must be there, and so must the mask.
     pub fn measure(scenes: &[Scene], layout: &ChannelLayout, gamma: f32) -> Result<Self, Error> {
-        Self::measure_on(processors().min(MAX_THREADS), scenes, layout, gamma)
+        Self::measure_on(
+            parallel::available().min(MAX_THREADS),
+            scenes,
+            layout,
+            gamma,
+        )
     }
 
     /// As [`Self::measure`], on a given number of threads.

@@ -15,7 +15,7 @@ use ::exr::prelude::Vec2;
 use super::decode::{check_density, decompress};
 use super::kept::Kept;
 use super::{MAX_PIXELS, MAX_SIDE};
-use crate::parallel::{self, processors};
+use crate::parallel;
 
 /// Blocks that are decoded or coded at once, in bytes of pixels, but at least one for each thread (ours: little beside an
 /// image).
@@ -84,7 +84,7 @@ impl<R: Read + Seek> Source<R> {
             tables,
             blocks,
             length,
-            threads: processors(),
+            threads: parallel::available(),
             kept: Kept::default(),
         })
     }

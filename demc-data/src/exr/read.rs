@@ -108,7 +108,8 @@ impl<R: Read + Seek> ExrFile<R> {
         })
     }
 
-    /// Decodes and codes on so many threads, in place of as many as there are processors.
+    /// Decodes and codes on so many threads, in place of as many as `RAYON_NUM_THREADS` says or as there are
+    /// processors.
     pub fn on_threads(mut self, threads: usize) -> Self {
         self.source.threads = threads.max(1);
         self
