@@ -81,6 +81,10 @@ def furnished_rooms(args, budget: views.Budget) -> Iterator[Base]:
         def load(index: int = index) -> mi.Scene:
             rng = np.random.default_rng([args.seed, index])
             room = Room(rng)
+            # Numbers of its own: the room is the same without a sun.
+            outside = np.random.default_rng([args.seed, index, 1])
+            if outside.random() < args.sun:
+                room.sun(outside)
             for view in range(args.views):
                 room.scene[f"camera{view}"] = room.camera(rng, args.size)
             return mi.load_dict(room.scene)
@@ -111,6 +115,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--rooms", type=int, default=0, metavar="N", help="rooms to render; each is its number and the seed")
     parser.add_argument("--views", type=int, default=2, metavar="N", help="of each room [2]")
     parser.add_argument("--size", type=int, default=224, metavar="PIXELS", help="both sides of a view of a room [224]")
+    parser.add_argument("--sun", type=float, default=0.6, metavar="SHARE", help="of the rooms with windows that the sun shines into [0.6]")
     parser.add_argument("--spp", type=int, default=4, metavar="N", help="samples a pixel of the noisy image [4]")
     parser.add_argument("--ref-spp", type=int, default=128, metavar="N", help="of the reference, at most [128]")
     parser.add_argument("--residual", type=float, default=0.03, metavar="X", help="expected RelMSE of a reference that is good enough [0.03]")

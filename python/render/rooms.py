@@ -22,6 +22,8 @@ class Room:
         self.palette = [color(rng) for _ in range(6)]
         self.materials = [self.material() for _ in range(rng.integers(6, 14))]
         self.targets: list[np.ndarray] = []
+        self.open_sides: list[int] = []
+        """Walls with windows, by number: 0 is that along the x axis, and so on around."""
 
         windows = rng.random() < 0.75
         self.shell(windows)
@@ -92,7 +94,7 @@ class Room:
         self.box([0, 0, -0.1], [x, y, 0], self.material())
         self.box([0, 0, z], [x, y, z + 0.1], {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": float(rng.uniform(0.5, 0.9))}}})
         wall, other = self.material(plain=True), self.material(plain=True)
-        open_sides = set(rng.choice(4, rng.choice([1, 1, 2, 3]), replace=False).tolist()) if windows else set()
+        self.open_sides = rng.choice(4, rng.choice([1, 1, 2, 3]), replace=False).tolist() if windows else []
         for side in range(4):
             length = x if side % 2 == 0 else y
             turned = mi.ScalarTransform4f()
@@ -100,7 +102,7 @@ class Room:
             corner = [(0, 0), (x, 0), (x, y), (0, y)][side]
             turned = turned.translate([corner[0], corner[1], 0]).rotate([0, 0, 1], 90 * side)
             bsdf = wall if rng.random() < 0.7 else other
-            if side in open_sides:
+            if side in self.open_sides:
                 self.windows(length, z, bsdf, turned)
             else:
                 self.box([0, -0.1, 0], [length, 0, z], bsdf, turned)
@@ -170,6 +172,22 @@ class Room:
                 self.add({"type": "sphere", "center": [*at, height], "radius": radius, "emitter": light})
                 hanging = rng.random() < 0.5
                 self.rod([*at, height + radius if hanging else 0], [*at, z if hanging else height - radius], 0.015, self.any_material())
+
+    def sun(self, rng: Rng) -> None:
+        """A sun without width that shines in through windows, where there are any: hard shadows of frames and blinds."""
+        if not self.open_sides:
+            return
+        elevation = np.radians(rng.uniform(10, 55))
+        # Wall 0 looks out along -y.
+        azimuth = np.radians(90 * (rng.choice(self.open_sides) - 1) + rng.uniform(-55, 55))
+        towards = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        power = np.exp(rng.uniform(np.log(2), np.log(60)))
+        irradiance = power * np.array([1, rng.uniform(0.75, 1), rng.uniform(0.5, 1)])
+        self.scene["sun"] = {
+            "type": "directional",
+            "direction": (-towards).tolist(),
+            "irradiance": {"type": "rgb", "value": irradiance.tolist()},
+        }
 
     # Furniture.
 

@@ -100,6 +100,24 @@ class Render(unittest.TestCase):
         self.assertLessEqual((bounded.color[below] / free.count).max(), 0.1 + 1e-6)
         self.assertLess(bounded.color[below].mean(), 0.7 * free.color[below].mean())
 
+    def test_the_sun_shines_in_through_a_window(self) -> None:
+        import numpy as np
+        from rooms import Room
+
+        inwards = np.array([[0, 1], [-1, 0], [0, -1], [1, 0]])
+        lit = 0
+        for seed in range(12):
+            room = Room(np.random.default_rng(seed))
+            room.sun(np.random.default_rng([seed, 1]))
+            self.assertEqual("sun" in room.scene, bool(room.open_sides))
+            if room.open_sides:
+                direction = np.array(room.scene["sun"]["direction"])
+                across = direction[:2] / np.linalg.norm(direction[:2])
+                self.assertGreater((inwards[room.open_sides] @ across).max(), np.cos(np.radians(55.1)))
+                self.assertLess(direction[2], 0)
+                lit += 1
+        self.assertGreater(lit, 4)
+
     def test_a_data_set_is_the_same_for_one_seed_and_goes_on_where_it_stopped(self) -> None:
         import numpy as np
         import views
