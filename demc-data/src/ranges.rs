@@ -74,6 +74,14 @@ impl Range {
             high: at(1.0 - TAIL),
         }
     }
+
+    /// The range that holds both.
+    fn with(self, other: Self) -> Self {
+        Self {
+            low: self.low.min(other.low),
+            high: self.high.max(other.high),
+        }
+    }
 }
 
 /// Where the summaries of the training scenes lie.
@@ -96,6 +104,18 @@ impl Ranges {
             exposure: range(&|scene| scene.exposure),
             mean: std::array::from_fn(|channel| range(&|scene| scene.mean[channel])),
             std: std::array::from_fn(|channel| range(&|scene| scene.std[channel])),
+        }
+    }
+
+    /// These and those of the scenes that the same weights saw before.
+    pub fn with(&self, before: &Ranges) -> Self {
+        let both = |a: &[Range; FEATURES], b: &[Range; FEATURES]| {
+            std::array::from_fn(|channel| a[channel].with(b[channel]))
+        };
+        Self {
+            exposure: self.exposure.with(before.exposure),
+            mean: both(&self.mean, &before.mean),
+            std: both(&self.std, &before.std),
         }
     }
 }
@@ -131,6 +151,17 @@ mod tests {
         let summary = Summary::of(&frame);
         assert_eq!((summary.mean[5], summary.std[5]), (3.0, 0.0));
         assert_eq!((summary.mean[6], summary.std[6]), (3.5, 0.5));
+    }
+
+    #[test]
+    fn ranges_with_those_before_hold_both() {
+        let of = |color, feature| Ranges::of(&[Summary::of(&frame(color, feature))]);
+        let both = of(0.25, 3.0).with(&of(1.0, 1.0));
+        let ends = |range: Range| [range.low, range.high];
+        assert!((ends(both.exposure)[0] - 0.25).abs() < 1e-6);
+        assert!((ends(both.exposure)[1] - 1.0).abs() < 1e-6);
+        assert_eq!(ends(both.mean[3]), [1.5, 3.5]);
+        assert_eq!(ends(both.std[3]), [0.5, 0.5]);
     }
 
     #[test]

@@ -8,6 +8,9 @@ use crate::layers::ConvBlock;
 use crate::ops::Maps;
 use crate::weights::{Builder, WeightsError};
 
+/// Blocks of the sub-network.
+pub const BLOCKS: usize = 4;
+
 /// Four convolutional blocks; the two in the middle are batch normalised.
 #[derive(Module, Debug)]
 pub struct Fusion {
@@ -25,7 +28,7 @@ impl Fusion {
             Detail::Open => Init::Color([OPEN_BIAS; DETAIL_CHANNELS]),
             Detail::Xavier => Init::Zeros,
         };
-        let blocks = [
+        let blocks: [_; BLOCKS] = [
             ([FEATURE_CHANNELS, width], false, Init::Zeros),
             ([width, width], true, Init::Zeros),
             ([width, width], true, Init::Zeros),

@@ -14,6 +14,7 @@ pub mod config;
 mod cost;
 pub mod decoder;
 pub mod denoiser;
+pub mod dormant;
 pub mod encoder;
 pub mod fusion;
 pub mod inference;

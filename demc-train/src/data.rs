@@ -4,6 +4,8 @@ use anyhow::Context;
 use demc_data::{
     ChannelLayout, DataConfig, Dataset, Normalizer, Ranges, Scene, Split, Statistics, read_frame,
 };
+use demc_infer::bundle::BundleMeta;
+use demc_model::ModelConfig;
 
 /// A data set, opened, split and measured.
 #[derive(Debug)]
@@ -18,7 +20,7 @@ pub struct Data {
     pub test: Vec<Scene>,
     /// Gamma and the statistics of [`Self::train`].
     pub normalizer: Normalizer,
-    /// What each of [`Self::train`] was like.
+    /// What each of [`Self::train`] was like, and what the weights that the run began with had seen before.
     pub ranges: Ranges,
     /// Negative values of colour and reference that count as 0.
     pub clamped: u64,
@@ -59,6 +61,12 @@ impl Data {
             ranges: statistics.ranges,
             clamped,
         })
+    }
+
+    /// What belongs to weights of a network that is trained on this, at `step`.
+    pub fn meta(&self, model: ModelConfig, step: u64) -> BundleMeta {
+        BundleMeta::new(model, self.normalizer.clone(), self.layout.clone(), step)
+            .with_ranges(self.ranges.clone())
     }
 
     /// `10 training scenes, 2 for validation, 4 for testing`.

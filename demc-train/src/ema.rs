@@ -29,6 +29,11 @@ impl Ema {
         average.expect("it is away only within an update")
     }
 
+    /// Goes on from `average`, on the plain device.
+    pub fn replace(&mut self, average: Denoiser) {
+        self.average = Some(average);
+    }
+
     /// Takes in `live`, the network on the plain device after `steps` steps.
     ///
     /// The decay warms up as `(1 + steps) / (10 + steps)`, so that the drawn weights are soon forgotten.

@@ -15,7 +15,7 @@ use demc_data::{Batch, BatchLoader, PatchSource};
 use crate::chart::{Figure, Panel, Scale, Series, with_kind};
 use crate::config::Config;
 use crate::data::Data;
-use crate::initial::initial_model;
+use crate::initial::{Initial, initial_model};
 use crate::optimizer::Adam;
 use crate::trainer::Trainer;
 
@@ -90,7 +90,7 @@ pub fn sweep(
     let mut loader = BatchLoader::new(Arc::new(source), 0);
     let device = device.clone().autodiff();
     let trainer = || -> anyhow::Result<Trainer> {
-        let model = initial_model(config, data.normalizer.flat_color, &device)?;
+        let Initial { model, .. } = initial_model(config, data.normalizer.flat_color, &device)?;
         let adam = Adam::new(config.train.adam_epsilon);
         Ok(Trainer::new(config, model, adam, None, device.clone()))
     };

@@ -2,12 +2,21 @@
 
 use anyhow::{Context, ensure};
 use burn::tensor::Device;
+use demc_data::ranges::Ranges;
 use demc_infer::Bundle;
 use demc_model::{Denoiser, ModelConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use crate::config::Config;
+
+/// A network before its first step.
+pub struct Initial {
+    /// The network.
+    pub model: Denoiser,
+    /// Where the scenes lie that it was trained on before, if it was and its file knows.
+    pub ranges: Option<Ranges>,
+}
 
 /// The network of `train.init`, or one [`drawn`] from the run's seed.
 ///
@@ -19,10 +28,13 @@ pub fn initial_model(
     config: &Config,
     flat_color: [f32; 3],
     device: &Device,
-) -> anyhow::Result<Denoiser> {
+) -> anyhow::Result<Initial> {
     let init = &config.train.init;
     if init.as_os_str().is_empty() {
-        return Ok(drawn(&config.model, config.train.seed, flat_color, device));
+        return Ok(Initial {
+            model: drawn(&config.model, config.train.seed, flat_color, device),
+            ranges: None,
+        });
     }
     let Bundle { meta, model } = Bundle::load(init, device).context("train.init")?;
     let mut there = config.clone();
@@ -40,7 +52,10 @@ pub fn initial_model(
         init.display(),
         differences.join("; ")
     );
-    Ok(model)
+    Ok(Initial {
+        model,
+        ranges: meta.ranges,
+    })
 }
 
 /// A network drawn from a seed, its grey head at the best flat image.

@@ -6,6 +6,7 @@
 //! for bit. [`train`] is the loop that ties them together.
 
 pub mod ablation;
+pub mod census;
 pub mod chart;
 pub mod checkpoint;
 mod clock;
@@ -13,12 +14,14 @@ pub mod config;
 pub mod data;
 pub mod ema;
 pub mod estimate;
+mod faults;
 pub mod find_lr;
 pub mod initial;
 pub mod metrics_log;
 pub mod optimizer;
 pub mod plot;
 pub mod progress;
+pub mod rate;
 pub mod recorder;
 pub mod run_dir;
 mod running_statistics;

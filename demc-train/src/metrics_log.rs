@@ -42,6 +42,9 @@ pub struct Line {
     /// Share of the output's values that are zero where the reference is above 0.01.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zero_share: Option<f64>,
+    /// Share of the network's channels that are dormant: without a gradient for 175 steps, or ever.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub dormant: Option<f64>,
     /// Steps of the run that were skipped because they were not finite.
     pub skipped: u64,
     /// Patches a second since the line before, over the steps alone.
@@ -57,6 +60,7 @@ impl Line {
             ("train/loss", Some(self.loss)),
             ("train/learning_rate", Some(self.lr)),
             ("train/gradient_norm", Some(self.grad_norm)),
+            ("train/dormant_channels", self.dormant),
             ("train/patches_per_s", Some(self.patches_per_s)),
             ("train/skipped_steps", Some(self.skipped as f64)),
         ];
@@ -159,6 +163,7 @@ mod tests {
             valid_ssim: None,
             dead_channels: None,
             zero_share: None,
+            dormant: None,
             skipped: 0,
             patches_per_s: 9.0,
             elapsed_s,

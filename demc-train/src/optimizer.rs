@@ -8,13 +8,23 @@ use std::collections::BTreeMap;
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
+use demc_model::dormant::{Dormant, Renewal};
 use demc_model::ops::adam::{Moments, Rule, sum_of_squares};
 use demc_model::{Denoiser, Ops, Weight};
+
+use crate::rate::Rate;
 
 /// Decay of the first moment (the defaults of Kingma and Ba, which the paper does not change).
 const BETA_1: f32 = 0.9;
 /// Decay of the second moment.
 const BETA_2: f32 = 0.999;
+/// Steps without a gradient after which a channel is dormant.
+pub const DORMANT_STEPS: u64 = 175;
+/// A channel is dormant where its bias's first moment has fallen below this share of the second one's root: without a gradient
+/// that takes 175 steps, and with one, however small, it never happens. Ours.
+const GONE: f32 = 1e-8;
+/// The layer whose channels are the image.
+const HEAD: &str = "decoder.head";
 /// Suffix of the first moment's name in a checkpoint.
 const FIRST: &str = ".m";
 /// Suffix of the second moment's name.
@@ -47,12 +57,12 @@ impl Adam {
         self.steps
     }
 
-    /// The network after one step along `grads` at learning rate `lr`.
-    pub fn step(&mut self, lr: f64, model: Denoiser, grads: GradientsParams) -> Denoiser {
+    /// The network after one step along `grads`.
+    pub fn step(&mut self, rate: Rate, model: Denoiser, grads: GradientsParams) -> Denoiser {
         let mut mapper = Step {
             ops: model.ops(),
             adam: self,
-            lr,
+            rate,
             grads,
             path: Vec::new(),
         };
@@ -61,14 +71,39 @@ impl Adam {
         model
     }
 
+    /// Layers and their channels; those that have had no gradient for 175 steps, or none ever, are dormant.
+    pub fn dormant(&self) -> Dormant {
+        let biases = self.moments.iter().filter_map(|(name, moments)| {
+            let layer = name.strip_suffix(".bias").filter(|layer| *layer != HEAD)?;
+            let channels = values(&moments.first)
+                .into_iter()
+                .zip(values(&moments.second));
+            let dormant = channels.map(|(first, second)| first.abs() <= GONE * second.sqrt());
+            Some((layer.to_string(), dormant.collect()))
+        });
+        biases.collect()
+    }
+
+    /// Forgets what it knows of the weights that begin anew.
+    pub fn forget(&mut self, renewal: &Renewal) {
+        for (name, Moments { first, second }) in &mut self.moments {
+            let places: Vec<usize> = renewal.places(name).collect();
+            if places.is_empty() {
+                continue;
+            }
+            for moment in [first, second] {
+                let mut values = values(moment);
+                places.iter().for_each(|place| values[*place] = 0.0);
+                *moment = Tensor::from_data(values.as_slice(), &moment.device());
+            }
+        }
+    }
+
     /// The state on the host: two tensors a weight, by name.
     pub fn state(&self) -> Vec<Weight> {
         let moments = self.moments.iter().flat_map(|(name, moments)| {
             [(FIRST, &moments.first), (SECOND, &moments.second)].map(|(suffix, tensor)| {
-                let data = tensor
-                    .to_data()
-                    .try_to_vec::<f32>()
-                    .expect("moments are float32");
+                let data = values(tensor);
                 Weight {
                     name: format!("{name}{suffix}"),
                     shape: vec![data.len()],
@@ -115,11 +150,17 @@ impl Adam {
     }
 }
 
+/// A moment on the host.
+fn values(moment: &Tensor<1>) -> Vec<f32> {
+    let data = moment.to_data();
+    data.try_to_vec().expect("moments are float32")
+}
+
 /// One step over all weights of a network.
 struct Step<'a> {
     ops: Ops,
     adam: &'a mut Adam,
-    lr: f64,
+    rate: Rate,
     grads: GradientsParams,
     path: Vec<String>,
 }
@@ -142,7 +183,7 @@ impl ModuleMapper for Step<'_> {
         let moments = self.adam.moments.remove(&name);
         let (stepped, moments) = self.adam.rule.step(
             self.ops,
-            self.lr,
+            self.rate.of(&name, &tensor.dims()),
             self.adam.steps,
             tensor.inner(),
             grad,
@@ -200,6 +241,11 @@ mod tests {
     use demc_model::ModelConfig;
     use rand::SeedableRng;
 
+    const RATE: Rate = Rate {
+        lr: 1e-3,
+        fan_in: 0,
+    };
+
     fn model(device: &Device) -> Denoiser {
         let config = ModelConfig {
             width: 1,
@@ -233,7 +279,7 @@ mod tests {
         let mut oracle = AdamConfig::new().with_epsilon(1e-8).init();
         let mut adam = Adam::new(1e-8);
         for _ in 0..3 {
-            ours = adam.step(1e-3, ours, gradient(&theirs, &device));
+            ours = adam.step(RATE, ours, gradient(&theirs, &device));
             let grads = gradient(&theirs, &device);
             theirs = oracle.step(1e-3, theirs, grads);
         }
@@ -265,11 +311,11 @@ mod tests {
         let mut adam = Adam::new(1e-8);
         let first = model(&device);
         let grads = gradient(&first, &device);
-        let first = adam.step(1e-3, first, grads);
+        let first = adam.step(RATE, first, grads);
         let mut again = Adam::restore(1e-8, adam.steps(), adam.state(), &Device::flex()).unwrap();
         let grads = || gradient(&first, &device);
-        let a = adam.step(1e-3, first.clone(), grads()).weights();
-        let b = again.step(1e-3, first.clone(), grads()).weights();
+        let a = adam.step(RATE, first.clone(), grads()).weights();
+        let b = again.step(RATE, first.clone(), grads()).weights();
         assert!(trainable(a) == trainable(b));
     }
 

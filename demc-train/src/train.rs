@@ -8,15 +8,19 @@ use burn::module::Module;
 use burn::tensor::Device;
 use demc_data::{BatchLoader, PatchSource};
 use demc_infer::bundle::locate::BEST;
-use demc_infer::bundle::{Bundle, BundleMeta, Names, Precision};
+use demc_infer::bundle::{Bundle, Names, Precision};
 use demc_infer::evaluate::Report;
 use demc_model::Denoiser;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 
+use crate::census::Census;
 use crate::checkpoint::{self, Best, Checkpoint, Keep, Means, State, Store};
 use crate::clock::Clock;
 use crate::config::{Config, OnNan};
 use crate::data::Data;
-use crate::initial::initial_model;
+use crate::faults::patches_of;
+use crate::initial::{Initial, initial_model};
 use crate::metrics_log::Line;
 use crate::optimizer::Adam;
 use crate::recorder::{Recorder, timed};
@@ -28,8 +32,6 @@ use crate::watch::Setting;
 
 /// So many steps in a row that are not finite are the end of a run that skips them; ours.
 const MOST_SKIPPED: u64 = 100;
-/// Patches that an error names.
-const MOST_NAMED: usize = 8;
 
 /// A run that is ready to go.
 pub struct Run {
@@ -64,7 +66,7 @@ impl Run {
     /// Scenes smaller than a patch; a checkpoint that is not of this run; a `train.init` that does not fit.
     pub fn new(
         config: Config,
-        data: Data,
+        mut data: Data,
         dir: RunDir,
         checkpoint: Option<Checkpoint>,
         device: &Device,
@@ -84,7 +86,10 @@ impl Run {
                 adam,
                 state,
             }) => {
-                let expected = meta(&config, &data, state.step);
+                if let Some(ranges) = &bundle.meta.ranges {
+                    data.ranges = ranges.clone();
+                }
+                let expected = data.meta(config.model, state.step);
                 ensure!(
                     bundle.meta == expected,
                     "{}: the checkpoint has another network, layout or statistics than this run",
@@ -98,7 +103,11 @@ impl Run {
                 (bundle.model, average, adam, state)
             }
             None => {
-                let model = initial_model(&config, data.normalizer.flat_color, &device)?;
+                let Initial { model, ranges } =
+                    initial_model(&config, data.normalizer.flat_color, &device)?;
+                if let Some(before) = &ranges {
+                    data.ranges = data.ranges.with(before);
+                }
                 let adam = Adam::new(config.train.adam_epsilon);
                 (model, None, adam, State::start())
             }
@@ -182,11 +191,16 @@ impl Run {
             }
             if due(run.log_every) || validation.is_some() {
                 let line = self.line(lr, validation.as_ref());
+                let watch = &mut self.state.watch;
+                warnings.extend(line.dormant.and_then(|share| watch.dormant(share)));
                 recorder.line(line, &self.describe(&line))?;
                 self.state.since_log = Means::default();
             }
             for warning in warnings {
                 recorder.say(&format!("warning: step {at}: {warning}"));
+            }
+            if at.is_multiple_of(train.recycle) && at < train.steps {
+                self.recycle(&mut recorder);
             }
             let signal = signals.came();
             if due(run.checkpoint_every) || clock.is_due(&run) || signal.is_some() {
@@ -212,7 +226,10 @@ impl Run {
                 bail!(self.not_finite(step, lr));
             }
             self.state.skipped += 1;
-            let text = format!("not finite, skipped: {}", self.patches_of(step));
+            let text = format!(
+                "not finite, skipped: {}",
+                patches_of(step, self.source.scenes())
+            );
             return Ok(vec![text]);
         }
         self.skipped_in_a_row = 0;
@@ -247,27 +264,21 @@ impl Run {
             self.state.step,
             step.loss,
             step.grad_norm,
-            self.patches_of(step)
+            patches_of(step, self.source.scenes())
         )
     }
 
-    /// Scene, origin and loss of a step's patches; those that are not finite alone, where there are such.
-    fn patches_of(&self, step: &Step) -> String {
-        let bad = |loss: f64| !loss.is_finite();
-        let any = step.patches.iter().any(|(_, loss)| bad(*loss));
-        let named = step.patches.iter().filter(|(_, loss)| !any || bad(*loss));
-        let mut texts: Vec<String> = named
-            .map(|(patch, loss)| {
-                let scene = &self.source.scenes()[patch.scene as usize].name;
-                format!("{scene} (x {}, y {}): {loss:.4}", patch.x, patch.y)
-            })
-            .collect();
-        if texts.len() > MOST_NAMED {
-            let more = texts.len() - MOST_NAMED;
-            texts.truncate(MOST_NAMED);
-            texts.push(format!("{more} more"));
+    /// Lets dormant channels begin anew, by numbers that depend on seed and step alone.
+    fn recycle(&mut self, recorder: &mut Recorder) {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.config.train.seed);
+        rng.set_stream(self.state.step);
+        let Census { dormant, channels } = self.trainer.recycle(&mut rng);
+        if dormant > 0 {
+            recorder.say(&format!(
+                "step {}: {dormant} of {channels} channels were dormant and begin anew",
+                self.state.step
+            ));
         }
-        texts.join(", ")
     }
 
     fn save(&self) -> anyhow::Result<()> {
@@ -334,6 +345,7 @@ impl Run {
             valid_ssim: denoised.and_then(|score| score.ssim),
             dead_channels: health.and_then(|health| health.dead_channels),
             zero_share: health.map(|health| health.zero_share),
+            dormant: self.trainer.dormant().map(Census::share),
             skipped: self.state.skipped,
             patches_per_s: 0.0,
             elapsed_s: self.state.elapsed_s,
@@ -354,7 +366,7 @@ impl Run {
 
     /// A network of this run as it stands, with all that belongs to it.
     fn bundle_of(&self, model: Denoiser) -> Bundle {
-        let meta = meta(&self.config, &self.data, self.state.step);
+        let meta = self.data.meta(self.config.model, self.state.step);
         Bundle { meta, model }
     }
 
@@ -381,10 +393,4 @@ impl Run {
             .write("test.json", &serde_json::to_vec_pretty(&report)?)?;
         Ok(Some((bundle.meta.step, report)))
     }
-}
-
-/// What belongs to the weights of `step`.
-fn meta(config: &Config, data: &Data, step: u64) -> BundleMeta {
-    let (normalizer, layout) = (data.normalizer.clone(), data.layout.clone());
-    BundleMeta::new(config.model, normalizer, layout, step).with_ranges(data.ranges.clone())
 }

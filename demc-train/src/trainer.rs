@@ -5,11 +5,15 @@ use burn::optim::{GradientsAccumulator, GradientsParams};
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_data::{Batch, FEATURES, Patch};
 use demc_model::Denoiser;
+use demc_model::dormant::Renewal;
 use demc_model::loss::{dissimilarity, gamma_from_hdr};
+use rand::Rng;
 
+use crate::census::Census;
 use crate::config::{Config, TrainConfig};
 use crate::ema::Ema;
-use crate::optimizer::{Adam, grad_norm, scaled};
+use crate::optimizer::{Adam, DORMANT_STEPS, grad_norm, scaled};
+use crate::rate::Rate;
 use crate::running_statistics::RunningStatistics;
 
 /// A network in training.
@@ -145,6 +149,29 @@ impl Trainer {
         Ok(step)
     }
 
+    /// How many channels are dormant; `None` before step 175, when no channel can have lain still for as long.
+    pub fn dormant(&self) -> Option<Census> {
+        let late = self.adam.steps() >= DORMANT_STEPS;
+        late.then(|| Census::of(&self.adam.dormant()))
+    }
+
+    /// Lets dormant channels begin anew, in network, optimizer and average; what the network computes stays as it is.
+    pub fn recycle(&mut self, rng: &mut impl Rng) -> Census {
+        let dormant = self.adam.dormant();
+        let census = Census::of(&dormant);
+        if census.dormant > 0 {
+            let model = self.model();
+            let renewal = Renewal::draw(model.config(), &model.weights(), &dormant, rng);
+            self.model = Some(renewal.apply(self.model(), &self.device));
+            self.adam.forget(&renewal);
+            if let Some(ema) = &mut self.ema {
+                let plain = self.device.clone().without_autodiff();
+                ema.replace(renewal.apply(ema.model(), &plain));
+            }
+        }
+        census
+    }
+
     /// The mean loss of some batches; no step is taken.
     pub fn mean_loss(&self, batches: &[Batch]) -> f64 {
         let losses = batches.iter().map(|batch| {
@@ -164,7 +191,11 @@ impl Trainer {
             .model
             .take()
             .expect("the network is away only within a step");
-        let model = self.adam.step(lr, model, grads);
+        let rate = Rate {
+            lr,
+            fan_in: self.config.lr_fan_in,
+        };
+        let model = self.adam.step(rate, model, grads);
         if let Some(ema) = &mut self.ema {
             ema.update(&model.valid(), self.adam.steps());
         }
@@ -200,183 +231,4 @@ impl Trainer {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::convert::Infallible;
-
-    use demc_model::ModelConfig;
-
-    use super::*;
-    use crate::initial::drawn;
-
-    fn config(batch_size: usize, grad_accumulation: usize) -> Config {
-        let mut config = Config::default();
-        config.model = ModelConfig {
-            width: 2,
-            variant: demc_model::Variant::DemcNosn,
-            ..config.model
-        };
-        config.data.batch_size = batch_size;
-        config.train.grad_accumulation = grad_accumulation;
-        config
-    }
-
-    fn batch(size: usize, first: usize) -> Batch {
-        let pattern = |channels: usize, phase: f32| -> Vec<f32> {
-            let pixels = channels * 32 * 32;
-            (first * pixels..(first + size) * pixels)
-                .map(|i| 0.5 + 0.5 * (i as f32 * 0.013 + phase).sin())
-                .collect()
-        };
-        Batch {
-            size,
-            color_gamma: pattern(3, 0.0),
-            features_z: pattern(12, 1.0),
-            reference_hdr: pattern(3, 2.0),
-            patches: (0..size as u32)
-                .map(|x| Patch { scene: 0, y: 0, x })
-                .collect(),
-        }
-    }
-
-    fn trainer(config: &Config) -> Trainer {
-        let device = Device::flex().autodiff();
-        let model = drawn(&config.model, 1, [0.3; 3], &device);
-        Trainer::new(config, model, Adam::new(1e-8), None, device)
-    }
-
-    #[test]
-    fn the_loss_falls() {
-        let config = config(2, 1);
-        let mut trainer = trainer(&config);
-        let mut step = || {
-            trainer
-                .step(1e-2, || Ok::<_, Infallible>(batch(2, 0)))
-                .unwrap()
-                .loss
-        };
-        let first = step();
-        let last = (0..20).map(|_| step()).last().unwrap();
-        assert!(last < 0.7 * first, "{first} to {last}");
-    }
-
-    /// Without batch normalisation (DEMCnoSN as the paper has it) two halves make the whole.
-    #[test]
-    fn accumulated_batches_step_like_one() {
-        let mut whole = trainer(&config(4, 1));
-        let mut halves = trainer(&config(2, 2));
-        let a = whole
-            .step(1e-3, || Ok::<_, Infallible>(batch(4, 0)))
-            .unwrap();
-        let mut parts = [batch(2, 0), batch(2, 2)].into_iter();
-        let b = halves
-            .step(1e-3, || Ok::<_, Infallible>(parts.next().unwrap()))
-            .unwrap();
-        // Sums of float32 in another order.
-        assert!((a.loss / b.loss - 1.0).abs() < 1e-5, "{a:?} {b:?}");
-        assert!(
-            (a.grad_norm / b.grad_norm - 1.0).abs() < 1e-4,
-            "{a:?} {b:?}"
-        );
-    }
-
-    #[test]
-    fn clipping_bounds_the_gradient_and_reports_its_true_norm() {
-        let mut clipped_config = config(2, 1);
-        clipped_config.train.grad_clip = 1e-3;
-        let step = |config: &Config| {
-            trainer(config)
-                .step(1e-3, || Ok::<_, Infallible>(batch(2, 0)))
-                .unwrap()
-        };
-        assert_eq!(step(&clipped_config), step(&config(2, 1)));
-        assert!(step(&clipped_config).grad_norm > 1e-3);
-    }
-
-    /// On the kernels a step writes weights where they lie: had anything kept a reference to one (the graph, a copy of the
-    /// network), it would have been copied.
-    #[test]
-    fn a_step_on_kernels_leaves_weights_in_their_place() {
-        use burn::backend::Flex;
-        use burn::tensor::Tensor;
-        let config = config(2, 1);
-        let mut trainer = trainer(&config);
-        let place = |trainer: &Trainer| {
-            let conv = &trainer.model().encoders[0].levels[2].convs[1];
-            let weight: Tensor<4> = conv.weight.val().inner();
-            let weight = weight.try_into_primitive::<Flex>().expect("flex");
-            weight.bytes().as_ptr() as usize
-        };
-        let before = place(&trainer);
-        for _ in 0..2 {
-            let Ok(_) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
-            assert_eq!(place(&trainer), before);
-        }
-    }
-
-    /// By no more than the weight: a dissimilarity is at most 1.
-    #[test]
-    fn the_structural_term_adds_to_the_loss_and_moves_the_weights() {
-        let mut weighed = config(2, 1);
-        weighed.train.ssim = 3.0;
-        let (mut plain, mut structural) = (trainer(&config(2, 1)), trainer(&weighed));
-        let loss = |trainer: &mut Trainer| {
-            let Ok(step) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
-            step.loss
-        };
-        let added = loss(&mut structural) - loss(&mut plain);
-        assert!(added > 0.01 && added < 3.0, "{added}");
-        assert!(structural.model().weights() != plain.model().weights());
-    }
-
-    #[test]
-    fn every_patch_reports_its_loss() {
-        let step = trainer(&config(2, 2)).step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
-        let Ok(step) = step;
-        assert_eq!(step.patches.len(), 4);
-        let mean = step.patches.iter().map(|(_, loss)| loss).sum::<f64>() / 4.0;
-        assert_eq!(mean, step.loss);
-        assert!(step.patches[0].1 != step.patches[1].1);
-    }
-
-    /// Weights, running statistics, average and optimizer: a step along NaN leaves no trace.
-    #[test]
-    fn a_step_that_is_not_finite_is_not_taken() {
-        let mut config = config(2, 1);
-        config.model.variant = demc_model::Variant::Demc;
-        config.train.ema = 0.9;
-        let mut trainer = trainer(&config);
-        let Ok(_) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
-        let state = |trainer: &Trainer| {
-            let average = trainer.average().expect("an average").weights();
-            (trainer.model().weights(), average, trainer.adam().state())
-        };
-        let before = state(&trainer);
-        assert!(before.0.iter().any(|weight| !weight.is_trainable()));
-        let mut bad = batch(2, 0);
-        bad.features_z[40] = f32::NAN;
-        let Ok(step) = trainer.step(1e-3, || Ok::<_, Infallible>(bad.clone()));
-        assert!(!step.is_finite());
-        let unfinished: Vec<bool> = step.patches.iter().map(|(_, l)| l.is_finite()).collect();
-        assert_eq!(unfinished, [false, false], "batch normalisation spreads it");
-        assert!(state(&trainer) == before);
-        assert_eq!(trainer.adam().steps(), 1);
-        let Ok(step) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
-        assert!(step.is_finite() && state(&trainer) != before);
-    }
-
-    #[test]
-    fn the_average_is_what_ships() {
-        let mut config = config(2, 1);
-        let mut plain = trainer(&config);
-        config.train.ema = 0.5;
-        let mut averaged = trainer(&config);
-        for trainer in [&mut plain, &mut averaged] {
-            for _ in 0..3 {
-                let Ok(_) = trainer.step(1e-2, || Ok::<_, Infallible>(batch(2, 0)));
-            }
-        }
-        assert!(plain.model().weights() == averaged.model().weights());
-        assert!(plain.result().weights() == plain.model().weights());
-        assert!(averaged.result().weights() != averaged.model().weights());
-    }
-}
+mod tests;

@@ -23,6 +23,8 @@ const OWNED: f64 = 0.5;
 const FEWEST_SCENES: usize = 4;
 /// Share of the outputs that are zero where the reference is not, from which the output counts as pinned.
 const PINNED: f64 = 0.25;
+/// Share of the network's channels that are dormant, from which a network is not the one that was asked for.
+const DORMANT: f64 = 0.2;
 
 /// What a warning is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -33,6 +35,7 @@ enum Topic {
     OneScene,
     DeadChannels,
     PinnedOutput,
+    Dormant,
 }
 
 /// What a run has seen so far, as far as its warnings need it.
@@ -175,6 +178,21 @@ impl Watch {
         warnings
     }
 
+    /// Takes in the share of the channels that are dormant.
+    pub fn dormant(&mut self, share: f64) -> Option<String> {
+        if share < DORMANT {
+            return None;
+        }
+        self.once(Topic::Dormant, || {
+            format!(
+                "{:.0} % of the network's channels are dormant: zero everywhere, without a gradient, gone for good. Wide layers die \
+                 first, of steps that are too large for them: train.lr_fan_in = 96 makes those smaller, train.recycle = 1000 brings \
+                 dead channels back",
+                100.0 * share
+            )
+        })
+    }
+
     fn once(&mut self, topic: Topic, text: impl FnOnce() -> String) -> Option<String> {
         if self.said.contains(&topic) {
             return None;
@@ -205,6 +223,15 @@ mod tests {
             .enumerate()
             .flat_map(|(i, loss)| watch.step(setting, loss, [(i % scenes, loss)].into_iter()))
             .collect()
+    }
+
+    #[test]
+    fn many_dormant_channels_are_named_once() {
+        let mut watch = Watch::default();
+        assert_eq!(watch.dormant(0.1), None);
+        let said = watch.dormant(0.42).unwrap();
+        assert!(said.starts_with("42 % of the network's channels are dormant"));
+        assert_eq!(watch.dormant(0.5), None);
     }
 
     #[test]

@@ -8,6 +8,7 @@ use std::path::Path;
 use burn::tensor::Device;
 use common::{config, error_line, stderr, train};
 use demc_infer::Bundle;
+use demc_infer::bundle::{Names, Precision};
 
 /// The weights that a run is known by, in the order of their names, but for running statistics: those move whatever the
 /// learning rate.
@@ -59,6 +60,39 @@ fn a_run_begins_where_another_ended() {
     fs::remove_dir_all(&first).expect("the test's own");
     let output = train(&config, &third, &[&seeded[..], &["--resume"]].concat());
     assert!(output.status.success(), "{}", stderr(&output));
+}
+
+/// What the weights had seen before belongs to what the network knows, after a resume too.
+#[test]
+fn ranges_of_the_scenes_before_are_kept() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    let at = |name: &str| dir.path().join(name);
+    let (first, wide, second) = (at("first"), at("wide.safetensors"), at("second"));
+    let output = train(&config, &first, &["--set", "train.steps=2"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let mut bundle = Bundle::load(&first, &Device::flex()).expect("a network");
+    let own = bundle.meta.ranges.clone().expect("ranges");
+    bundle.meta.ranges.as_mut().expect("ranges").exposure.high = 99.0;
+    let saved = bundle.save(&wide, Names::Burn, Precision::F32);
+    saved.expect("a file");
+
+    let init = format!("train.init={}", wide.display());
+    let again = ["--set", "train.steps=2", "--set", &init];
+    let ranges_after = |more: &[&str]| {
+        let output = train(&config, &second, &[&again[..], more].concat());
+        assert!(output.status.success(), "{}", stderr(&output));
+        let bundle = Bundle::load(&second, &Device::flex()).expect("a network");
+        bundle.meta.ranges.expect("ranges")
+    };
+    let found = ranges_after(&[]);
+    assert_eq!(found.exposure.high, 99.0);
+    assert_eq!(
+        (found.exposure.low, &found.mean),
+        (own.exposure.low, &own.mean)
+    );
+    fs::remove_file(&wide).expect("the test's own");
+    assert_eq!(ranges_after(&["--resume"]), found);
 }
 
 #[test]

@@ -78,6 +78,30 @@ def pattern(rng: Rng, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.clip(image * (0.85 + 0.3 * bumps[..., None] * rng.random()), 0.01, 0.95)
 
 
+def grain(rng: Rng) -> np.ndarray:
+    """What boards, stone or cloth do to a colour: factors around 0.8 with detail down to the texel, `[256, 256, 1]`."""
+    n = TEXTURE_SIDE
+    y, x = np.mgrid[0:n, 0:n] / n
+    kind = rng.choice(["boards", "stone", "cloth"], p=[0.55, 0.3, 0.15])
+    if kind == "boards":
+        boards, ends = int(rng.integers(4, 17)), int(rng.integers(1, 5))
+        row = np.floor(y * boards).astype(int)
+        along = x * ends + rng.random(boards)[row]
+        board = (np.floor(along).astype(int) + 7 * row) % 61
+        fibres = np.stack([np.interp(x[0], np.linspace(0, 1, 13), knots) for knots in rng.random((n, 13))])
+        factor = rng.uniform(0.4, 1.15, 61)[board] * (0.6 + 0.4 * fibres + 0.4 * noise(rng, n, n, 6))
+        joint = ((y * boards) % 1 < 0.04) | (along % 1 < 0.01)
+        factor = np.where(joint, 0.4 * factor, factor)
+    elif kind == "stone":
+        veins = np.abs(noise(rng, n, n, 5) - 0.5) * rng.uniform(2, 8)
+        factor = 0.3 + 0.5 * np.minimum(veins, 1) + 0.4 * noise(rng, n, n, 6) * rng.random((n, n))
+    else:
+        threads = int(rng.integers(12, 49))
+        weave = 0.5 + 0.5 * np.sin(2 * np.pi * threads * x) * np.sin(2 * np.pi * threads * y)
+        factor = 0.35 + 0.6 * weave + 0.25 * noise(rng, n, n, 5)
+    return factor[..., None]
+
+
 def mosaic(rng: Rng, colors: list) -> np.ndarray:
     """A picture: the nearest of some points says which colour."""
     n = TEXTURE_SIDE

@@ -6,17 +6,20 @@ Lengths are metres, z is up, the floor is z = 0 and the room's corner the origin
 from __future__ import annotations
 
 import numpy as np
-from patterns import Rng, color, mosaic, pattern, sky
+from patterns import TEXTURE_SIDE, Rng, color, grain, mosaic, pattern, sky
 from variant import mi
 
 METALS = ("Al", "Ag", "Au", "Cu", "Cr", "W")
 
 
 class Room:
-    """One room: a Mitsuba scene that grows shape by shape."""
+    """One room: a Mitsuba scene that grows shape by shape.
 
-    def __init__(self, rng: Rng) -> None:
-        self.rng = rng
+    A share of what it is painted with has a grain, by numbers of its own: all else is the same without.
+    """
+
+    def __init__(self, rng: Rng, grained: float = 0.0, grains: Rng | None = None) -> None:
+        self.rng, self.grained, self.grains = rng, grained, grains
         self.size = np.array([rng.uniform(3, 9), rng.uniform(3, 9), rng.uniform(2.3, 3.8)])
         self.scene: dict = {"type": "scene"}
         self.palette = [color(rng) for _ in range(6)]
@@ -40,10 +43,18 @@ class Room:
 
     def paint(self) -> dict:
         """A colour, or a pattern of two."""
+        grained = self.grains is not None and self.grains.random() < self.grained
         if self.rng.random() < 0.45:
-            return {"type": "rgb", "value": self.tint()}
-        image = pattern(self.rng, np.array(self.tint()), np.array(self.tint()))
-        scale = float(np.exp(self.rng.uniform(np.log(0.7), np.log(6))))
+            tint = self.tint()
+            if not grained:
+                return {"type": "rgb", "value": tint}
+            image = np.full((TEXTURE_SIDE, TEXTURE_SIDE, 3), tint)
+            scale = float(np.exp(self.grains.uniform(np.log(0.5), np.log(3))))
+        else:
+            image = pattern(self.rng, np.array(self.tint()), np.array(self.tint()))
+            scale = float(np.exp(self.rng.uniform(np.log(0.7), np.log(6))))
+        if grained:
+            image = np.clip(image * grain(self.grains), 0.005, 0.95)
         transform = mi.ScalarTransform3f().scale([scale, scale])
         return {"type": "bitmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "raw": True, "to_uv": transform}
 

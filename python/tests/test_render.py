@@ -118,6 +118,25 @@ class Render(unittest.TestCase):
                 lit += 1
         self.assertGreater(lit, 4)
 
+    def test_a_grain_changes_paint_and_nothing_else(self) -> None:
+        import numpy as np
+        from rooms import Room
+
+        def textures(value) -> list:
+            """Bitmaps and colours of a scene, in order."""
+            if not isinstance(value, dict):
+                return []
+            if value.get("type") in ("bitmap", "rgb"):
+                return [value]
+            return [found for inner in value.values() for found in textures(inner)]
+
+        plain, grained = (Room(np.random.default_rng(3), share, np.random.default_rng(9)) for share in (0.0, 1.0))
+        self.assertEqual(list(plain.scene), list(grained.scene))
+        shapes = [(room.scene[name]["type"], str(room.scene[name].get("to_world"))) for name in plain.scene if name != "type" for room in (plain, grained)]
+        self.assertEqual(shapes[::2], shapes[1::2])
+        kinds = [[texture["type"] for texture in textures(room.scene)] for room in (plain, grained)]
+        self.assertGreater(kinds[1].count("bitmap"), kinds[0].count("bitmap"))
+
     def test_a_data_set_is_the_same_for_one_seed_and_goes_on_where_it_stopped(self) -> None:
         import numpy as np
         import views

@@ -181,6 +181,12 @@ impl Config {
             "at most 1000000000",
         );
         require(
+            train.recycle <= MOST_STEPS,
+            "train.recycle",
+            &train.recycle,
+            "at most 1000000000",
+        );
+        require(
             run.keep_every <= MOST_STEPS,
             "run.keep_every",
             &run.keep_every,

@@ -38,6 +38,9 @@ pub struct TrainConfig {
     pub lr_end: f64,
     /// The way from the one to the other.
     pub decay: Decay,
+    /// Kernels whose outputs sum up more inputs than this learn at a rate that is smaller in proportion. 0: all alike, as in
+    /// the paper.
+    pub lr_fan_in: usize,
     /// Steps at the beginning over which the learning rate climbs from nearly 0 to its course; 0: none, as in the paper.
     pub warmup: u64,
     /// Adam's epsilon.
@@ -55,6 +58,8 @@ pub struct TrainConfig {
     /// Share of the moving average of the weights that a step keeps, from 0 to below 1. 0: no average, as in the paper. With
     /// one, validation, test and `demc-infer` use the averaged weights.
     pub ema: f64,
+    /// Steps between two searches for dormant channels, which then begin anew ([`demc_model::dormant`]). 0: none, as in the paper.
+    pub recycle: u64,
     /// What happens at a loss or gradient that is not finite.
     pub on_nan: OnNan,
     /// Weights to begin with: a run directory, a checkpoint or an exported file of the same `[model]`. Empty: drawn from `seed`.
@@ -71,6 +76,7 @@ impl Default for TrainConfig {
             lr_start: LR_START,
             lr_end: LR_END,
             decay: Decay::Exponential,
+            lr_fan_in: 0,
             warmup: 0,
             adam_epsilon: ADAM_EPSILON,
             loss: Loss::default(),
@@ -79,6 +85,7 @@ impl Default for TrainConfig {
             grad_accumulation: 1,
             grad_clip: 0.0,
             ema: 0.0,
+            recycle: 0,
             on_nan: OnNan::default(),
             init: PathBuf::new(),
             seed: 1,
