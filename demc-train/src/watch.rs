@@ -23,8 +23,9 @@ const OWNED: f64 = 0.5;
 const FEWEST_SCENES: usize = 4;
 /// Share of the outputs that are zero where the reference is not, from which the output counts as pinned.
 const PINNED: f64 = 0.25;
-/// Share of the network's channels that are dormant, from which a network is not the one that was asked for.
-const DORMANT: f64 = 0.2;
+/// Share of the network's channels that are dormant, from which a network is not the one that was asked for. A quarter is common in a
+/// run's first hundreds of steps, and comes back.
+const DORMANT: f64 = 0.3;
 
 /// What a warning is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -185,9 +186,9 @@ impl Watch {
         }
         self.once(Topic::Dormant, || {
             format!(
-                "{:.0} % of the network's channels are dormant: zero everywhere, without a gradient, gone for good. Wide layers die \
-                 first, of steps that are too large for them: train.lr_fan_in = 96 makes those smaller, train.recycle = 1000 brings \
-                 dead channels back",
+                "{:.0} % of the network's channels are dormant: zero everywhere, without a gradient for 175 steps. Wide layers go first, \
+                 by steps that are too large for them: train.lr_fan_in = 96 makes those smaller, train.recycle = 1000 lets dormant \
+                 channels begin anew",
                 100.0 * share
             )
         })
