@@ -65,7 +65,7 @@ impl ModelConfig {
                     other => Source::Images(other.channels()),
                 })
                 .collect();
-            for level in 0..LEVELS {
+            for (level, skips) in skips.iter_mut().enumerate() {
                 let (skip_after, pooled) = (
                     reading.skip_after[level],
                     feeds_latent || level + 1 < LEVELS,
@@ -78,7 +78,7 @@ impl ModelConfig {
                     let path = format!("encoders.{e}.levels.{level}.convs.{conv}");
                     inputs = vec![add(path, inputs)];
                     if conv + 1 == skip_after {
-                        skips[level].extend(inputs.clone());
+                        skips.extend(inputs.clone());
                     }
                 }
             }
