@@ -80,11 +80,14 @@ def furnished_rooms(args, budget: views.Budget) -> Iterator[Base]:
 
         def load(index: int = index) -> mi.Scene:
             rng = np.random.default_rng([args.seed, index])
-            # Numbers of their own: the room is the same without a grain or a sun.
+            # Numbers of their own: the room is the same without grains, a sun or black.
             room = Room(rng, args.grain, np.random.default_rng([args.seed, index, 2]))
             outside = np.random.default_rng([args.seed, index, 1])
             if outside.random() < args.sun:
                 room.sun(outside)
+            paint = np.random.default_rng([args.seed, index, 3])
+            if paint.random() < args.black:
+                room.blacken(paint)
             for view in range(args.views):
                 room.scene[f"camera{view}"] = room.camera(rng, args.size)
             return mi.load_dict(room.scene)
@@ -117,6 +120,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--size", type=int, default=224, metavar="PIXELS", help="both sides of a view of a room [224]")
     parser.add_argument("--sun", type=float, default=0.6, metavar="SHARE", help="of the rooms with windows that the sun shines into [0.6]")
     parser.add_argument("--grain", type=float, default=0.6, metavar="SHARE", help="of the colours and patterns that are boards, stone or cloth [0.6]")
+    parser.add_argument("--black", type=float, default=0.2, metavar="SHARE", help="of the rooms whose bars and blinds are black [0.2]")
     parser.add_argument("--spp", type=int, default=4, metavar="N", help="samples a pixel of the noisy image [4]")
     parser.add_argument("--ref-spp", type=int, default=128, metavar="N", help="of the reference, at most [128]")
     parser.add_argument("--residual", type=float, default=0.03, metavar="X", help="expected RelMSE of a reference that is good enough [0.03]")

@@ -25,6 +25,8 @@ class Room:
         self.palette = [color(rng) for _ in range(6)]
         self.materials = [self.material() for _ in range(rng.integers(6, 14))]
         self.targets: list[np.ndarray] = []
+        self.frames: list[dict] = []
+        """What bars, blinds and curtains are made of."""
         self.open_sides: list[int] = []
         """Walls with windows, by number: 0 is that along the x axis, and so on around."""
 
@@ -129,6 +131,7 @@ class Room:
         top = float(rng.uniform(max(sill + 0.7, 0.6 * height), height - 0.1))
         width = float(length / count * rng.uniform(0.4, 0.9))
         frame = self.any_material()
+        self.frames.append(frame)
         if sill:
             self.box([0, -0.1, 0], [length, 0, sill], wall, place)
         self.box([0, -0.1, top], [length, 0, height], wall, place)
@@ -199,6 +202,14 @@ class Room:
             "direction": (-towards).tolist(),
             "irradiance": {"type": "rgb", "value": irradiance.tolist()},
         }
+
+    def blacken(self, rng: Rng) -> None:
+        """Makes bars and blinds black, and what else is of their material: no colour is, and slats before a bright sky often are."""
+        reflectance = {"type": "rgb", "value": float(rng.uniform(0, 0.02))}
+        black = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
+        for shape in self.scene.values():
+            if isinstance(shape, dict) and any(shape.get("bsdf") is frame for frame in self.frames):
+                shape["bsdf"] = black
 
     # Furniture.
 

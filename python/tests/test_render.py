@@ -118,6 +118,21 @@ class Render(unittest.TestCase):
                 lit += 1
         self.assertGreater(lit, 4)
 
+    def test_black_blinds_are_all_that_becomes_black(self) -> None:
+        import numpy as np
+        from rooms import Room
+
+        seeds = (seed for seed in range(50) if Room(np.random.default_rng(seed)).frames)
+        room = Room(np.random.default_rng(next(seeds)))
+        before = {name: shape["bsdf"] for name, shape in room.scene.items() if isinstance(shape, dict) and "bsdf" in shape}
+        room.blacken(np.random.default_rng(1))
+        changed = [name for name, bsdf in before.items() if room.scene[name]["bsdf"] is not bsdf]
+        self.assertTrue(changed)
+        self.assertLess(len(changed), len(before))
+        for name in changed:
+            self.assertTrue(any(before[name] is frame for frame in room.frames))
+            self.assertLess(room.scene[name]["bsdf"]["bsdf"]["reflectance"]["value"], 0.02)
+
     def test_a_grain_changes_paint_and_nothing_else(self) -> None:
         import numpy as np
         from rooms import Room
