@@ -10,12 +10,20 @@ use rand::{Rng, RngExt};
 
 use crate::config::{FEATURE_CHANNELS, Input, LEVELS, ModelConfig};
 use crate::denoiser::Denoiser;
-use crate::fusion::BLOCKS;
+use crate::fusion::{BLOCKS, DETAIL_LAYER};
 use crate::init::OPEN_BIAS;
-use crate::weights::{Weight, Weights};
+use crate::weights::{Weight, Weights, fan_in, is_deconvolution};
 
 /// Bias of a channel that begins anew; ours: a little above zero, so that it is open at half of the pixels and more.
 const FRESH_BIAS: f32 = 0.1;
+
+/// A batch normalisation that begins anew is the identity.
+const NORM_START: [(&str, f32); 4] = [
+    ("gamma", 1.0),
+    ("beta", 0.0),
+    ("running_mean", 0.0),
+    ("running_var", 1.0),
+];
 
 /// Channels by the path of the layer that computes them, such as `encoders.0.levels.1.convs.2`: `true` where one is dormant.
 pub type Dormant = BTreeMap<String, Vec<bool>>;
@@ -131,12 +139,12 @@ impl Renewal {
                 })
                 .collect();
             let name = format!("{path}.weight");
-            let transposed = path.ends_with("deconv");
-            let taps: usize = shapes[&*name][2..].iter().product();
+            let shape = shapes[&*name];
+            let taps: usize = shape[2..].iter().product();
             let mut places = Vec::new();
             for (o, fresh) in outputs.iter().enumerate() {
                 let place = |i: usize| {
-                    let kernel = match transposed {
+                    let kernel = match is_deconvolution(path) {
                         true => i * outputs.len() + o,
                         false => o * inputs.len() + i,
                     };
@@ -144,9 +152,7 @@ impl Renewal {
                 };
                 match fresh {
                     true => {
-                        // With stride 2, a quarter of a deconvolution's taps reaches each output.
-                        let reach = if transposed { taps / 4 } else { taps };
-                        let drawn = centred(inputs.len() * taps, inputs.len() * reach, rng);
+                        let drawn = centred(inputs.len() * taps, fan_in(&name, shape), rng);
                         places.extend((0..inputs.len()).flat_map(place).zip(drawn));
                     }
                     false => {
@@ -155,9 +161,9 @@ impl Renewal {
                     }
                 }
             }
-            let bias = match *path == format!("fusion.blocks.{}.conv", BLOCKS - 1) {
-                true => OPEN_BIAS,
-                false => FRESH_BIAS,
+            let bias = match &**path {
+                DETAIL_LAYER => OPEN_BIAS,
+                _ => FRESH_BIAS,
             };
             let each = |value: f32| {
                 let fresh = outputs.iter().enumerate().filter(|(_, fresh)| **fresh);
@@ -165,15 +171,9 @@ impl Renewal {
             };
             renewal.insert(format!("{path}.bias"), each(bias));
             renewal.insert(name, places);
-            let norm = norm_of(path);
-            for (tensor, value) in [
-                ("gamma", 1.0),
-                ("beta", 0.0),
-                ("running_mean", 0.0),
-                ("running_var", 1.0),
-            ] {
-                let name = format!("{norm}.{tensor}");
-                if shapes.contains_key(&*name) {
+            for (tensor, value) in NORM_START {
+                let name = norm_of(path).map(|norm| format!("{norm}.{tensor}"));
+                if let Some(name) = name.filter(|name| shapes.contains_key(&**name)) {
                     renewal.insert(name, each(value));
                 }
             }
@@ -213,10 +213,13 @@ fn centred(count: usize, fan_in: usize, rng: &mut impl Rng) -> Vec<f32> {
     values
 }
 
-/// The path of the normalisation after the layer at `path`, if there is one: `latent.conv` has `latent.norm`.
-fn norm_of(path: &str) -> String {
-    let (module, _) = path.rsplit_once('.').expect("layers are parts of modules");
-    format!("{module}.norm")
+/// Where the normalisation after the layer at `path` is, if it has one: `latent.norm` for `latent.conv`. A level's fusion, beside
+/// its deconvolution, has none.
+fn norm_of(path: &str) -> Option<String> {
+    let module = path
+        .strip_suffix("deconv")
+        .or_else(|| path.strip_suffix("conv"))?;
+    Some(format!("{module}norm"))
 }
 
 #[cfg(test)]
@@ -273,14 +276,19 @@ mod tests {
         ("decoder.levels.3.fuse", 2),
     ];
 
+    /// By the shift before the ReLU: a normalisation's, where there is one. Only what a ReLU follows can be killed.
     fn killed(model: &Denoiser, device: &Device) -> (Denoiser, Dormant) {
         let mut weights = model.weights();
         let mut dormant = Dormant::new();
+        let fusions_have_one = model.config().reading.spec().activated_fusion;
         for (path, count) in KILLED {
-            let named = |tensor: &str| format!("{path}.{tensor}");
-            let bias = weights
-                .iter_mut()
-                .find(|weight| weight.name == named("bias"));
+            if path.ends_with("fuse") && !fusions_have_one {
+                continue;
+            }
+            let shift = norm_of(path).map(|norm| format!("{norm}.beta"));
+            let shift = shift.filter(|beta| weights.iter().any(|weight| weight.name == *beta));
+            let shift = shift.unwrap_or_else(|| format!("{path}.bias"));
+            let bias = weights.iter_mut().find(|weight| weight.name == shift);
             let bias = bias.expect("the layer is there");
             bias.data[..count].fill(-1e3);
             let flags = (0..bias.data.len()).map(|channel| channel < count);
@@ -305,7 +313,7 @@ mod tests {
     #[test]
     fn a_renewed_network_computes_what_it_did() {
         let device = Device::flex();
-        for config in all_configs().filter(|config| config.reading == Reading::Paper) {
+        for config in all_configs() {
             let (model, dormant) = killed(&drawn(&config, &device), &device);
             let mut rng = ChaCha8Rng::seed_from_u64(1);
             let renewal = Renewal::draw(&config, &model.weights(), &dormant, &mut rng);

@@ -10,6 +10,8 @@ use crate::weights::{Builder, WeightsError};
 
 /// Blocks of the sub-network.
 pub const BLOCKS: usize = 4;
+/// Path of the convolution whose three channels are the detail map: the last block's.
+pub const DETAIL_LAYER: &str = "fusion.blocks.3.conv";
 
 /// Four convolutional blocks; the two in the middle are batch normalised.
 #[derive(Module, Debug)]

@@ -24,6 +24,23 @@ pub struct Weight {
     pub data: Vec<f32>,
 }
 
+/// The inputs that one output sums up in the layer with the weight `name` of this shape: 1 for what is no kernel.
+///
+/// # Shapes
+/// Convolutions `[out, in, h, w]`; deconvolutions `[in, out, h, w]`, whose stride of 2 lets a quarter of the taps reach each output.
+pub fn fan_in(name: &str, shape: &[usize]) -> usize {
+    match *shape {
+        [inputs, _, height, width] if is_deconvolution(name) => inputs * height * width / 4,
+        [_, inputs, height, width] => inputs * height * width,
+        _ => 1,
+    }
+}
+
+/// Whether a layer or weight is a deconvolution's, by its name: its first two axes are the other way round.
+pub(crate) fn is_deconvolution(name: &str) -> bool {
+    name.contains("deconv")
+}
+
 /// The weights of a trained network by name, to be taken one by one.
 #[derive(Debug, Default)]
 pub struct Weights(BTreeMap<String, Weight>);

@@ -3,7 +3,14 @@
 //!
 //! Adam moves every weight by about the learning rate, whatever its gradient. What a layer reads is never negative behind ReLUs, so
 //! the steps of one output's weights add up: at 1e-3 the 2304 weights of an output of the deepest layers at width 32 move it by up to 2.3
-//! times the mean of its inputs, in one step. That is how channels fall below zero for good.
+//! times the mean of its inputs, in one step. So channels fall below zero, and stay there.
+
+use demc_model::fusion::DETAIL_LAYER;
+use demc_model::weights::fan_in;
+
+/// What the detail map's convolution counts its inputs times: its three channels are all that the encoder behind it sees, and one that
+/// falls below zero is a third of them. Ours. A bias counts once, like any other.
+const DETAIL_FACTOR: usize = 10;
 
 /// How far one step may move a weight.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -15,9 +22,9 @@ pub struct Rate {
 }
 
 impl Rate {
-    /// The rate of the weight with this name and shape. A bias has that of its layer's inputs: one.
+    /// The rate of the weight with this name and shape. A bias counts as one input.
     pub fn of(self, name: &str, shape: &[usize]) -> f64 {
-        match fan_in(name, shape) {
+        match inputs(name, shape) {
             inputs if inputs > self.fan_in && self.fan_in > 0 => {
                 self.lr * self.fan_in as f64 / inputs as f64
             }
@@ -26,17 +33,11 @@ impl Rate {
     }
 }
 
-/// The inputs that one output of this weight's layer sums up.
-fn fan_in(name: &str, shape: &[usize]) -> usize {
-    match *shape {
-        // [in, out, 4, 4] with stride 2: a quarter of the kernel reaches each output.
-        [inputs, _, height, width] if name.contains("deconv") => inputs * height * width / 4,
-        // The three channels of the detail map.
-        [_, inputs, height, width] if name.starts_with("fusion.blocks.3") => {
-            10 * inputs * height * width
-        }
-        [_, inputs, height, width] => inputs * height * width,
-        _ => 1,
+/// The inputs that count: the detail map's convolution is as sensitive as one of many more.
+fn inputs(name: &str, shape: &[usize]) -> usize {
+    match name.strip_suffix(".weight") {
+        Some(DETAIL_LAYER) => DETAIL_FACTOR * fan_in(name, shape),
+        _ => fan_in(name, shape),
     }
 }
 

@@ -38,7 +38,7 @@ pub struct TrainConfig {
     pub lr_end: f64,
     /// The way from the one to the other.
     pub decay: Decay,
-    /// Kernels whose outputs sum up more inputs than this learn at a rate that is smaller in proportion. 0: all alike, as in
+    /// Kernels whose outputs sum up more inputs than this learn at a rate that is smaller in proportion ([`crate::rate`]). 0: all alike, as in
     /// the paper.
     pub lr_fan_in: usize,
     /// Steps at the beginning over which the learning rate climbs from nearly 0 to its course; 0: none, as in the paper.
