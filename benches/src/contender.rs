@@ -8,7 +8,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use demc_infer::Bundle;
 use demc_model::Denoiser;
 use demc_train::Config;
-use demc_train::optimizer::Adam;
+use demc_train::optimizer::Optimizer;
 use demc_train::trainer::{Step, Trainer};
 
 use crate::case::Input;
@@ -29,9 +29,9 @@ impl Training {
         };
         let device = device.clone().autodiff();
         let model = moved(&bundle.model, &device);
-        let adam = Adam::new(config.train.adam_epsilon);
+        let optimizer = Optimizer::new(&config.train);
         Training {
-            trainer: Trainer::new(&config, model, adam, None, device),
+            trainer: Trainer::new(&config, model, optimizer, None, device),
             input,
             lr,
         }

@@ -10,7 +10,7 @@ use demc_data::{Batch, FEATURES, Patch};
 use crate::config::Config;
 use crate::data::Data;
 use crate::initial::drawn;
-use crate::optimizer::Adam;
+use crate::optimizer::Optimizer;
 use crate::trainer::Trainer;
 
 /// A forward pass as a share of forward, backward and optimizer; ours, measured between 0.2 and 0.4.
@@ -40,7 +40,13 @@ impl Estimate {
         let mut single = config.clone();
         single.train.grad_accumulation = 1;
         let model = drawn(&config.model, 0, data.normalizer.flat_color, device);
-        let mut trainer = Trainer::new(&single, model, Adam::new(1e-8), None, device.clone());
+        let mut trainer = Trainer::new(
+            &single,
+            model,
+            Optimizer::new(&single.train),
+            None,
+            device.clone(),
+        );
         let mut once = |batch: &Batch| {
             let started = Instant::now();
             let Ok(_) = trainer.step(0.0, || Ok::<_, Infallible>(batch.clone()));

@@ -16,7 +16,7 @@ use crate::chart::{Figure, Panel, Scale, Series, with_kind};
 use crate::config::Config;
 use crate::data::Data;
 use crate::initial::{Initial, initial_model};
-use crate::optimizer::Adam;
+use crate::optimizer::Optimizer;
 use crate::trainer::Trainer;
 
 /// What a smoothed ratio keeps of the one before; ours.
@@ -91,8 +91,8 @@ pub fn sweep(
     let device = device.clone().autodiff();
     let trainer = || -> anyhow::Result<Trainer> {
         let Initial { model, .. } = initial_model(config, data.normalizer.flat_color, &device)?;
-        let adam = Adam::new(config.train.adam_epsilon);
-        Ok(Trainer::new(config, model, adam, None, device.clone()))
+        let optimizer = Optimizer::new(&config.train);
+        Ok(Trainer::new(config, model, optimizer, None, device.clone()))
     };
     let (mut trained, untrained) = (trainer()?, trainer()?);
     let mut found = Ratios::default();

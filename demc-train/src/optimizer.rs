@@ -1,6 +1,7 @@
-//! Adam (Kingma and Ba 2014) and what happens to a gradient before it: its norm, and clipping to one.
+//! Adam (Kingma and Ba 2014), or Muon (Jordan et al. 2024) for the kernels, and what happens to a gradient before it: its norm, and
+//! clipping to one.
 //!
-//! The arithmetic of a step is Burn's ([`demc_model::ops::adam`]); its state is kept here, by the names of the weights, because Burn's
+//! The arithmetic of a step is Burn's ([`demc_model::ops::adam`], [`demc_model::ops::muon`]); its state is kept here, by the names of the weights, because Burn's
 //! whole-module optimizer restores state on a default device that may not exist on the machine at hand.
 
 use std::collections::BTreeMap;
@@ -10,8 +11,10 @@ use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_model::dormant::{Dormant, Renewal};
 use demc_model::ops::adam::{Moments, Rule, sum_of_squares};
+use demc_model::ops::muon;
 use demc_model::{Denoiser, Ops, Weight};
 
+use crate::config::TrainConfig;
 use crate::rate::Rate;
 
 /// Decay of the first moment (the defaults of Kingma and Ba, which the paper does not change).
@@ -29,26 +32,56 @@ const HEAD: &str = "decoder.head";
 const FIRST: &str = ".m";
 /// Suffix of the second moment's name.
 const SECOND: &str = ".v";
+/// Suffix of the name of Muon's sum of gradients.
+const VELOCITY: &str = ".velocity";
 
-/// Adam over a network's trainable weights.
-pub struct Adam {
+/// Adam over a network's trainable weights; over kernels of up to `train.muon` outputs, Muon.
+pub struct Optimizer {
     rule: Rule,
+    muon: usize,
     steps: u64,
-    moments: BTreeMap<String, Moments>,
+    memories: BTreeMap<String, Memory>,
 }
 
-impl Adam {
+/// What is kept of a weight's gradients, flattened.
+enum Memory {
+    Adam(Moments),
+    Muon(Tensor<1>),
+}
+
+impl Memory {
+    /// The tensors, with the suffixes of their names in a checkpoint.
+    fn tensors(&self) -> Vec<(&'static str, &Tensor<1>)> {
+        match self {
+            Memory::Adam(Moments { first, second }) => vec![(FIRST, first), (SECOND, second)],
+            Memory::Muon(velocity) => vec![(VELOCITY, velocity)],
+        }
+    }
+
+    fn map(self, f: impl Fn(Tensor<1>) -> Tensor<1>) -> Self {
+        match self {
+            Memory::Adam(Moments { first, second }) => Memory::Adam(Moments {
+                first: f(first),
+                second: f(second),
+            }),
+            Memory::Muon(velocity) => Memory::Muon(f(velocity)),
+        }
+    }
+}
+
+impl Optimizer {
     /// A fresh optimizer.
-    pub fn new(epsilon: f32) -> Self {
+    pub fn new(config: &TrainConfig) -> Self {
         let rule = Rule {
             beta_1: BETA_1,
             beta_2: BETA_2,
-            epsilon,
+            epsilon: config.adam_epsilon,
         };
-        Adam {
+        Optimizer {
             rule,
+            muon: config.muon,
             steps: 0,
-            moments: BTreeMap::new(),
+            memories: BTreeMap::new(),
         }
     }
 
@@ -61,7 +94,7 @@ impl Adam {
     pub fn step(&mut self, rate: Rate, model: Denoiser, grads: GradientsParams) -> Denoiser {
         let mut mapper = Step {
             ops: model.ops(),
-            adam: self,
+            optimizer: self,
             rate,
             grads,
             path: Vec::new(),
@@ -73,8 +106,11 @@ impl Adam {
 
     /// Layers and their channels; those that have had no gradient for 175 steps, or none ever, are dormant.
     pub fn dormant(&self) -> Dormant {
-        let biases = self.moments.iter().filter_map(|(name, moments)| {
+        let biases = self.memories.iter().filter_map(|(name, memory)| {
             let layer = name.strip_suffix(".bias").filter(|layer| *layer != HEAD)?;
+            let Memory::Adam(moments) = memory else {
+                return None;
+            };
             let channels = values(&moments.first)
                 .into_iter()
                 .zip(values(&moments.second));
@@ -86,23 +122,28 @@ impl Adam {
 
     /// Forgets what it knows of the weights that begin anew.
     pub fn forget(&mut self, renewal: &Renewal) {
-        for (name, Moments { first, second }) in &mut self.moments {
-            let places: Vec<usize> = renewal.places(name).collect();
-            if places.is_empty() {
-                continue;
-            }
-            for moment in [first, second] {
-                let mut values = values(moment);
-                places.iter().for_each(|place| values[*place] = 0.0);
-                *moment = Tensor::from_data(values.as_slice(), &moment.device());
-            }
-        }
+        let memories = std::mem::take(&mut self.memories).into_iter();
+        self.memories = memories
+            .map(|(name, memory)| {
+                let places: Vec<usize> = renewal.places(&name).collect();
+                if places.is_empty() {
+                    return (name, memory);
+                }
+                let memory = memory.map(|tensor| {
+                    let mut values = values(&tensor);
+                    places.iter().for_each(|place| values[*place] = 0.0);
+                    Tensor::from_data(values.as_slice(), &tensor.device())
+                });
+                (name, memory)
+            })
+            .collect();
     }
 
-    /// The state on the host: two tensors a weight, by name.
+    /// The state on the host: two tensors a weight that Adam moves, one a kernel that Muon moves, by name.
     pub fn state(&self) -> Vec<Weight> {
-        let moments = self.moments.iter().flat_map(|(name, moments)| {
-            [(FIRST, &moments.first), (SECOND, &moments.second)].map(|(suffix, tensor)| {
+        let tensors = self.memories.iter().flat_map(|(name, memory)| {
+            let tensors = memory.tensors().into_iter();
+            tensors.map(move |(suffix, tensor)| {
                 let data = values(tensor);
                 Weight {
                     name: format!("{name}{suffix}"),
@@ -111,13 +152,13 @@ impl Adam {
                 }
             })
         });
-        moments.collect()
+        tensors.collect()
     }
 
     /// The optimizer that [`Self::state`] describes after `steps` steps; the name of a moment whose partner is missing
     /// as the error.
     pub fn restore(
-        epsilon: f32,
+        config: &TrainConfig,
         steps: u64,
         state: Vec<Weight>,
         device: &Device,
@@ -129,37 +170,44 @@ impl Adam {
                 (weight.name, Tensor::from_data(data, device))
             })
             .collect();
-        let mut adam = Adam {
-            steps,
-            ..Adam::new(epsilon)
-        };
+        let mut memories = BTreeMap::new();
         while let Some((name, tensor)) = tensors.pop_first() {
-            let weight = name.strip_suffix(FIRST).ok_or_else(|| name.clone())?;
-            let second = tensors
-                .remove(&format!("{weight}{SECOND}"))
-                .ok_or_else(|| name.clone())?;
-            adam.moments.insert(
-                weight.to_string(),
-                Moments {
-                    first: tensor,
-                    second,
-                },
-            );
+            let (weight, memory) = if let Some(weight) = name.strip_suffix(VELOCITY) {
+                (weight, Memory::Muon(tensor))
+            } else {
+                let weight = name.strip_suffix(FIRST).ok_or_else(|| name.clone())?;
+                let second = tensors
+                    .remove(&format!("{weight}{SECOND}"))
+                    .ok_or_else(|| name.clone())?;
+                let first = tensor;
+                (weight, Memory::Adam(Moments { first, second }))
+            };
+            memories.insert(weight.to_string(), memory);
         }
-        Ok(adam)
+        Ok(Optimizer {
+            steps,
+            memories,
+            ..Optimizer::new(config)
+        })
+    }
+
+    /// Whether Muon moves the weight with this name and shape. The head's outputs are the image, no features: Adam's, as with Jordan et al.
+    fn is_muons(&self, name: &str, shape: &[usize]) -> bool {
+        let outputs = muon::outputs(name, shape);
+        outputs.is_some_and(|outputs| outputs <= self.muon) && !name.starts_with(HEAD)
     }
 }
 
-/// A moment on the host.
-fn values(moment: &Tensor<1>) -> Vec<f32> {
-    let data = moment.to_data();
+/// A tensor on the host.
+fn values(tensor: &Tensor<1>) -> Vec<f32> {
+    let data = tensor.to_data();
     data.try_to_vec().expect("moments are float32")
 }
 
 /// One step over all weights of a network.
 struct Step<'a> {
     ops: Ops,
-    adam: &'a mut Adam,
+    optimizer: &'a mut Optimizer,
     rate: Rate,
     grads: GradientsParams,
     path: Vec<String>,
@@ -180,16 +228,33 @@ impl ModuleMapper for Step<'_> {
             return Param::from_mapped_value(id, tensor, mapper);
         };
         let name = self.path.join(".");
-        let moments = self.adam.moments.remove(&name);
-        let (stepped, moments) = self.adam.rule.step(
-            self.ops,
-            self.rate.of(&name, &tensor.dims()),
-            self.adam.steps,
-            tensor.inner(),
-            grad,
-            moments,
-        );
-        self.adam.moments.insert(name, moments);
+        let shape = tensor.dims();
+        let optimizer = &mut *self.optimizer;
+        let memory = optimizer.memories.remove(&name);
+        let (stepped, memory) = if optimizer.is_muons(&name, &shape) {
+            let velocity = match memory {
+                Some(Memory::Muon(velocity)) => Some(velocity),
+                _ => None,
+            };
+            let (stepped, velocity) =
+                muon::step(&name, self.rate.lr, tensor.inner(), grad, velocity);
+            (stepped, Memory::Muon(velocity))
+        } else {
+            let moments = match memory {
+                Some(Memory::Adam(moments)) => Some(moments),
+                _ => None,
+            };
+            let (stepped, moments) = optimizer.rule.step(
+                self.ops,
+                self.rate.of(&name, &shape),
+                optimizer.steps,
+                tensor.inner(),
+                grad,
+                moments,
+            );
+            (stepped, Memory::Adam(moments))
+        };
+        optimizer.memories.insert(name, memory);
         let tensor = Tensor::from_inner(stepped).require_grad();
         Param::from_mapped_value(id, tensor, mapper)
     }
@@ -277,7 +342,7 @@ mod tests {
         let mut theirs = model(&device).with_ops(ops);
         let mut ours = model(&device).with_ops(ops);
         let mut oracle = AdamConfig::new().with_epsilon(1e-8).init();
-        let mut adam = Adam::new(1e-8);
+        let mut adam = Optimizer::new(&TrainConfig::default());
         for _ in 0..3 {
             ours = adam.step(RATE, ours, gradient(&theirs, &device));
             let grads = gradient(&theirs, &device);
@@ -305,16 +370,52 @@ mod tests {
         }
     }
 
+    /// Levels of width 1 have 1, 2, 4, 8 and 8 outputs: Muon moves some of them.
+    fn muon() -> TrainConfig {
+        TrainConfig {
+            muon: 4,
+            ..TrainConfig::default()
+        }
+    }
+
+    #[test]
+    fn muon_moves_kernels_of_so_many_outputs_and_not_the_head() {
+        let device = Device::flex().autodiff();
+        let model = model(&device);
+        let mut optimizer = Optimizer::new(&muon());
+        let grads = gradient(&model, &device);
+        optimizer.step(RATE, model, grads);
+        let names: Vec<String> = optimizer.state().into_iter().map(|w| w.name).collect();
+        let has = |name: &str| names.iter().any(|n| n == name);
+        for kernel in [
+            "fusion.blocks.3.conv.weight",
+            "encoders.1.levels.2.convs.0.weight",
+            "decoder.levels.2.deconv.weight",
+            "decoder.levels.4.fuse.weight",
+        ] {
+            assert!(has(&format!("{kernel}.velocity")) && !has(&format!("{kernel}.m")));
+        }
+        for other in [
+            "encoders.1.levels.3.convs.0.weight",
+            "decoder.levels.1.deconv.weight",
+            "decoder.head.weight",
+            "encoders.1.levels.0.convs.0.bias",
+        ] {
+            assert!(!has(&format!("{other}.velocity")) && has(&format!("{other}.m")));
+        }
+    }
+
     #[test]
     fn restored_optimizer_goes_on_bit_for_bit() {
         let device = Device::flex().autodiff();
-        let mut adam = Adam::new(1e-8);
+        let mut optimizer = Optimizer::new(&muon());
         let first = model(&device);
         let grads = gradient(&first, &device);
-        let first = adam.step(RATE, first, grads);
-        let mut again = Adam::restore(1e-8, adam.steps(), adam.state(), &Device::flex()).unwrap();
+        let first = optimizer.step(RATE, first, grads);
+        let (steps, state) = (optimizer.steps(), optimizer.state());
+        let mut again = Optimizer::restore(&muon(), steps, state, &Device::flex()).unwrap();
         let grads = || gradient(&first, &device);
-        let a = adam.step(RATE, first.clone(), grads()).weights();
+        let a = optimizer.step(RATE, first.clone(), grads()).weights();
         let b = again.step(RATE, first.clone(), grads()).weights();
         assert!(trainable(a) == trainable(b));
     }
@@ -327,7 +428,7 @@ mod tests {
             data: vec![0.0],
         }];
         assert_eq!(
-            Adam::restore(1e-8, 1, state, &Device::flex()).err(),
+            Optimizer::restore(&TrainConfig::default(), 1, state, &Device::flex()).err(),
             Some("head.m".to_string())
         );
     }

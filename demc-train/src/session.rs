@@ -145,7 +145,7 @@ fn latest(
     };
     notes.extend(damaged);
     let device = device.clone().autodiff();
-    let checkpoint = checkpoint::load(&intact, config.train.adam_epsilon, &device)?;
+    let checkpoint = checkpoint::load(&intact, &config.train, &device)?;
     notes.push(format!("going on from {}", intact.display()));
     if written {
         notes.extend(checkpoint::restore_run(run, &intact)?);

@@ -22,7 +22,7 @@ use crate::data::Data;
 use crate::faults::patches_of;
 use crate::initial::{Initial, initial_model};
 use crate::metrics_log::Line;
-use crate::optimizer::Adam;
+use crate::optimizer::Optimizer;
 use crate::recorder::{Recorder, timed};
 use crate::run_dir::{Facts, RunDir};
 use crate::signals::Signals;
@@ -79,11 +79,11 @@ impl Run {
             data.normalizer.clone(),
             config.train.seed,
         )?;
-        let (model, average, adam, state) = match checkpoint {
+        let (model, average, optimizer, state) = match checkpoint {
             Some(Checkpoint {
                 bundle,
                 average,
-                adam,
+                optimizer,
                 state,
             }) => {
                 if let Some(ranges) = &bundle.meta.ranges {
@@ -100,7 +100,7 @@ impl Run {
                     "{}: the checkpoint and train.ema do not agree on whether there is an average",
                     dir.path().display()
                 );
-                (bundle.model, average, adam, state)
+                (bundle.model, average, optimizer, state)
             }
             None => {
                 let Initial { model, ranges } =
@@ -108,11 +108,11 @@ impl Run {
                 if let Some(before) = &ranges {
                     data.ranges = data.ranges.with(before);
                 }
-                let adam = Adam::new(config.train.adam_epsilon);
-                (model, None, adam, State::start())
+                let optimizer = Optimizer::new(&config.train);
+                (model, None, optimizer, State::start())
             }
         };
-        let trainer = Trainer::new(&config, model, adam, average, device);
+        let trainer = Trainer::new(&config, model, optimizer, average, device);
         Ok(Run {
             config,
             data,
@@ -296,7 +296,7 @@ impl Run {
             self.dir.path(),
             &bundle,
             average.as_ref(),
-            self.trainer.adam(),
+            self.trainer.optimizer(),
             &self.state,
             keep,
         )

@@ -1,4 +1,4 @@
-//! One optimizer step: batches, forward, loss (Eq. 5), backward, clipping, Adam, the average of the weights.
+//! One optimizer step: batches, forward, loss (Eq. 5), backward, clipping, Adam or Muon, the average of the weights.
 
 use burn::module::Module;
 use burn::optim::{GradientsAccumulator, GradientsParams};
@@ -12,14 +12,14 @@ use rand::Rng;
 use crate::census::Census;
 use crate::config::{Config, TrainConfig};
 use crate::ema::Ema;
-use crate::optimizer::{Adam, DORMANT_STEPS, grad_norm, scaled};
+use crate::optimizer::{DORMANT_STEPS, Optimizer, grad_norm, scaled};
 use crate::rate::Rate;
 use crate::running_statistics::RunningStatistics;
 
 /// A network in training.
 pub struct Trainer {
     model: Option<Denoiser>,
-    adam: Adam,
+    optimizer: Optimizer,
     ema: Option<Ema>,
     device: Device,
     config: TrainConfig,
@@ -53,7 +53,7 @@ impl Trainer {
     pub fn new(
         config: &Config,
         model: Denoiser,
-        adam: Adam,
+        optimizer: Optimizer,
         average: Option<Denoiser>,
         device: Device,
     ) -> Self {
@@ -65,7 +65,7 @@ impl Trainer {
         let ema = (decay > 0.0).then(|| Ema::new(decay, average.unwrap_or_else(|| model.valid())));
         Trainer {
             model: Some(model),
-            adam,
+            optimizer,
             ema,
             device,
             config: config.train.clone(),
@@ -81,8 +81,8 @@ impl Trainer {
     }
 
     /// The optimizer as it stands.
-    pub fn adam(&self) -> &Adam {
-        &self.adam
+    pub fn optimizer(&self) -> &Optimizer {
+        &self.optimizer
     }
 
     /// The network to judge and to ship, on the plain device: the average, where there is one.
@@ -151,19 +151,19 @@ impl Trainer {
 
     /// How many channels are dormant; `None` before step 175, when no channel can have lain still for as long.
     pub fn dormant(&self) -> Option<Census> {
-        let late = self.adam.steps() >= DORMANT_STEPS;
-        late.then(|| Census::of(&self.adam.dormant()))
+        let late = self.optimizer.steps() >= DORMANT_STEPS;
+        late.then(|| Census::of(&self.optimizer.dormant()))
     }
 
     /// Lets dormant channels begin anew, in network, optimizer and average; what the network computes stays as it is.
     pub fn recycle(&mut self, rng: &mut impl Rng) -> Census {
-        let dormant = self.adam.dormant();
+        let dormant = self.optimizer.dormant();
         let census = Census::of(&dormant);
         if census.dormant > 0 {
             let model = self.model();
             let renewal = Renewal::draw(model.config(), &model.weights(), &dormant, rng);
             self.model = Some(renewal.apply(self.model(), &self.device));
-            self.adam.forget(&renewal);
+            self.optimizer.forget(&renewal);
             if let Some(ema) = &mut self.ema {
                 let plain = self.device.clone().without_autodiff();
                 ema.replace(renewal.apply(ema.model(), &plain));
@@ -195,9 +195,9 @@ impl Trainer {
             lr,
             fan_in: self.config.lr_fan_in,
         };
-        let model = self.adam.step(rate, model, grads);
+        let model = self.optimizer.step(rate, model, grads);
         if let Some(ema) = &mut self.ema {
-            ema.update(&model.valid(), self.adam.steps());
+            ema.update(&model.valid(), self.optimizer.steps());
         }
         self.model = Some(model);
     }

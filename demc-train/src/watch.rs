@@ -187,8 +187,8 @@ impl Watch {
         self.once(Topic::Dormant, || {
             format!(
                 "{:.0} % of the network's channels are dormant: zero everywhere, without a gradient for 175 steps. Wide layers go first, \
-                 by steps that are too large for them: train.lr_fan_in = 96 makes those smaller, train.recycle = 1000 lets dormant \
-                 channels begin anew",
+                 by steps that are too large for them: train.muon = 128 takes steps that keep more of them alive, train.lr_fan_in = 96 \
+                 makes those of the others smaller, train.recycle = 1000 lets dormant channels begin anew",
                 100.0 * share
             )
         })

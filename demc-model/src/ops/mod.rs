@@ -10,12 +10,14 @@
 //! | `kernels/` | the kernels as a Burn backend extension for `flex`, with gradients |
 //! | `stock` | the same operations made of Burn's |
 //! | `adam` | the optimizer's step and the norm of a gradient, in place where the kernels run |
+//! | `muon` | the other optimizer's step |
 //! | `average` | the moving average of weights, likewise |
 
 pub mod adam;
 pub mod average;
 mod kernels;
 mod maps;
+pub mod muon;
 mod stock;
 
 use std::fmt;

@@ -4,7 +4,7 @@
 //! RUN/latest                                              text: step-00000500
 //! RUN/checkpoints/step-00000500/model.safetensors         a bundle of the network in training
 //! RUN/checkpoints/step-00000500/average.safetensors       a bundle of the averaged network, with train.ema
-//! RUN/checkpoints/step-00000500/optimizer.safetensors     Adam's moments by weight
+//! RUN/checkpoints/step-00000500/optimizer.safetensors     the optimizer's moments by weight
 //! RUN/checkpoints/step-00000500/state.json                the state of the loop
 //! RUN/checkpoints/step-00000500/best.safetensors          the best weights so far (a link, where the file system has links)
 //! RUN/checkpoints/step-00000500/config.toml, run.json, ... copies of the run's own files
@@ -27,14 +27,15 @@ use demc_infer::bundle::{Bundle, Names, Precision, tensors};
 use demc_model::Denoiser;
 use serde::{Deserialize, Serialize};
 
-use crate::optimizer::Adam;
+use crate::config::TrainConfig;
+use crate::optimizer::Optimizer;
 use crate::run_dir::OWN_FILES;
 use crate::watch::Watch;
 pub use store::{Found, Keep, Store};
 
 /// Version of a checkpoint's files; goes up when a meaning changes.
 pub const FORMAT: u32 = 2;
-/// Adam's moments.
+/// The optimizer's moments.
 const OPTIMIZER: &str = "optimizer.safetensors";
 /// The state of the loop.
 const STATE: &str = "state.json";
@@ -101,7 +102,7 @@ pub struct Checkpoint {
     /// The averaged network, on the plain device.
     pub average: Option<Denoiser>,
     /// The optimizer.
-    pub adam: Adam,
+    pub optimizer: Optimizer,
     /// The loop.
     pub state: State,
 }
@@ -114,14 +115,14 @@ pub fn save(
     run: &Path,
     bundle: &Bundle,
     average: Option<&Bundle>,
-    adam: &Adam,
+    optimizer: &Optimizer,
     state: &State,
     keep: Keep,
 ) -> anyhow::Result<()> {
     let bytes = |bundle: &Bundle| bundle.to_bytes(Names::Burn, Precision::F32);
     let mut files = vec![
         (MODEL, bytes(bundle)?),
-        (OPTIMIZER, tensors::to_bytes(&adam.state())?),
+        (OPTIMIZER, tensors::to_bytes(&optimizer.state())?),
         (STATE, serde_json::to_vec_pretty(state)?),
     ];
     if let Some(average) = average {
@@ -141,7 +142,7 @@ pub fn save(
 ///
 /// # Errors
 /// A file that is not there, of another version, or does not fit the others.
-pub fn load(dir: &Path, adam_epsilon: f32, device: &Device) -> anyhow::Result<Checkpoint> {
+pub fn load(dir: &Path, config: &TrainConfig, device: &Device) -> anyhow::Result<Checkpoint> {
     let state = read_state(&dir.join(STATE))?;
     let bundle = Bundle::load(&dir.join(MODEL), device)?;
     let step = bundle.meta.step;
@@ -172,12 +173,12 @@ pub fn load(dir: &Path, adam_epsilon: f32, device: &Device) -> anyhow::Result<Ch
         "{}: moments of another network",
         path.display()
     );
-    let adam = Adam::restore(adam_epsilon, taken, moments, &plain)
+    let optimizer = Optimizer::restore(config, taken, moments, &plain)
         .map_err(|name| anyhow::anyhow!("{}: moment {name} has no partner", path.display()))?;
     Ok(Checkpoint {
         bundle,
         average,
-        adam,
+        optimizer,
         state,
     })
 }

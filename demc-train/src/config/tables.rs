@@ -41,6 +41,8 @@ pub struct TrainConfig {
     /// Kernels whose outputs sum up more inputs than this learn at a rate that is smaller in proportion ([`crate::rate`]). 0: all alike, as in
     /// the paper.
     pub lr_fan_in: usize,
+    /// Kernels of up to so many outputs step as Muon does ([`demc_model::ops::muon`]), all other weights as Adam does. 0: Adam alone, as in the paper.
+    pub muon: usize,
     /// Steps at the beginning over which the learning rate climbs from nearly 0 to its course; 0: none, as in the paper.
     pub warmup: u64,
     /// Adam's epsilon.
@@ -77,6 +79,7 @@ impl Default for TrainConfig {
             lr_end: LR_END,
             decay: Decay::Exponential,
             lr_fan_in: 0,
+            muon: 0,
             warmup: 0,
             adam_epsilon: ADAM_EPSILON,
             loss: Loss::default(),

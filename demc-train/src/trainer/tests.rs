@@ -40,7 +40,7 @@ fn batch(size: usize, first: usize) -> Batch {
 fn trainer(config: &Config) -> Trainer {
     let device = Device::flex().autodiff();
     let model = drawn(&config.model, 1, [0.3; 3], &device);
-    Trainer::new(config, model, Adam::new(1e-8), None, device)
+    Trainer::new(config, model, Optimizer::new(&config.train), None, device)
 }
 
 #[test]
@@ -147,7 +147,11 @@ fn a_step_that_is_not_finite_is_not_taken() {
     let Ok(_) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
     let state = |trainer: &Trainer| {
         let average = trainer.average().expect("an average").weights();
-        (trainer.model().weights(), average, trainer.adam().state())
+        (
+            trainer.model().weights(),
+            average,
+            trainer.optimizer().state(),
+        )
     };
     let before = state(&trainer);
     assert!(before.0.iter().any(|weight| !weight.is_trainable()));
@@ -158,7 +162,7 @@ fn a_step_that_is_not_finite_is_not_taken() {
     let unfinished: Vec<bool> = step.patches.iter().map(|(_, l)| l.is_finite()).collect();
     assert_eq!(unfinished, [false, false], "batch normalisation spreads it");
     assert!(state(&trainer) == before);
-    assert_eq!(trainer.adam().steps(), 1);
+    assert_eq!(trainer.optimizer().steps(), 1);
     let Ok(step) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
     assert!(step.is_finite() && state(&trainer) != before);
 }
@@ -190,14 +194,20 @@ fn dormant_channels_begin_anew() {
     let latent = weights.iter_mut().find(|w| w.name == "latent.conv.bias");
     latent.expect("a latent").data.fill(-100.0);
     let model = config.model.load(&mut Weights::new(weights), &device);
-    let mut trainer = Trainer::new(&config, model.unwrap(), Adam::new(1e-8), None, device);
+    let mut trainer = Trainer::new(
+        &config,
+        model.unwrap(),
+        Optimizer::new(&config.train),
+        None,
+        device,
+    );
     let steps = |trainer: &mut Trainer, count: u64| {
         for _ in 0..count {
             let Ok(_) = trainer.step(1e-4, || Ok::<_, Infallible>(batch(2, 0)));
         }
     };
     let of_latent = |trainer: &Trainer| {
-        let flags = &trainer.adam().dormant()["latent.conv"];
+        let flags = &trainer.optimizer().dormant()["latent.conv"];
         flags.iter().filter(|dormant| **dormant).count()
     };
     steps(&mut trainer, DORMANT_STEPS - 1);

@@ -15,7 +15,7 @@ pub fn config(dir: &Path) -> PathBuf {
     let text = format!(
         "[model]\nwidth = 2\nreading = \"released\"\n\
          [data]\nroot = {:?}\npatch_size = 64\nbatch_size = 2\nvalidation = 0.2\naugment = true\n\
-         [train]\nsteps = 12\nema = 0.9\nrecycle = 5\nlr_fan_in = 32\nlr_start = 1e-3\ngrad_accumulation = 2\ngrad_clip = 1.0\n\
+         [train]\nsteps = 12\nema = 0.9\nrecycle = 5\nlr_fan_in = 32\nmuon = 4\nlr_start = 1e-3\ngrad_accumulation = 2\ngrad_clip = 1.0\n\
          [run]\nlog_every = 2\nvalidate_every = 4\ncheckpoint_every = 3\nkeep = 2\n",
         sample()
     );
