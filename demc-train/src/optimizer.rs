@@ -191,6 +191,20 @@ impl Optimizer {
         })
     }
 
+    /// Whether it knows of each of these trainable weights what a step needs, and of no others.
+    pub fn fits(&self, weights: &[Weight]) -> bool {
+        let known = |weight: &&Weight| {
+            let size = weight.data.len();
+            let muons = self.is_muons(&weight.name, &weight.shape);
+            self.memories.get(&weight.name).is_some_and(|memory| {
+                matches!(memory, Memory::Muon(_)) == muons
+                    && memory.tensors().iter().all(|(_, t)| t.dims() == [size])
+            })
+        };
+        let trainable: Vec<&Weight> = weights.iter().filter(|w| w.is_trainable()).collect();
+        trainable.len() == self.memories.len() && trainable.iter().all(known)
+    }
+
     /// Whether Muon moves the weight with this name and shape. The head's outputs are the image, no features: Adam's, as with Jordan et al.
     fn is_muons(&self, name: &str, shape: &[usize]) -> bool {
         let outputs = muon::outputs(name, shape);
@@ -413,7 +427,10 @@ mod tests {
         let grads = gradient(&first, &device);
         let first = optimizer.step(RATE, first, grads);
         let (steps, state) = (optimizer.steps(), optimizer.state());
-        let mut again = Optimizer::restore(&muon(), steps, state, &Device::flex()).unwrap();
+        let mut again = Optimizer::restore(&muon(), steps, state.clone(), &Device::flex()).unwrap();
+        assert!(again.fits(&first.weights()));
+        let other = Optimizer::restore(&TrainConfig::default(), steps, state, &Device::flex());
+        assert!(!other.unwrap().fits(&first.weights()));
         let grads = || gradient(&first, &device);
         let a = optimizer.step(RATE, first.clone(), grads()).weights();
         let b = again.step(RATE, first.clone(), grads()).weights();

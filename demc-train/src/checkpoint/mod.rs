@@ -162,19 +162,14 @@ pub fn load(dir: &Path, config: &TrainConfig, device: &Device) -> anyhow::Result
     let bytes = fs::read(&path).with_context(|| path.display().to_string())?;
     let moments = tensors::from_bytes(&bytes)
         .map_err(|error| anyhow::anyhow!("{}: {error}", path.display()))?;
-    let weights = bundle.model.weights();
-    let expected = weights
-        .iter()
-        .filter(|weight| weight.is_trainable())
-        .count();
     let taken = state.step - state.skipped;
+    let optimizer = Optimizer::restore(config, taken, moments, &plain)
+        .map_err(|name| anyhow::anyhow!("{}: moment {name} has no partner", path.display()))?;
     ensure!(
-        moments.len() == 2 * expected || taken == 0,
+        optimizer.fits(&bundle.model.weights()) || taken == 0,
         "{}: moments of another network",
         path.display()
     );
-    let optimizer = Optimizer::restore(config, taken, moments, &plain)
-        .map_err(|name| anyhow::anyhow!("{}: moment {name} has no partner", path.display()))?;
     Ok(Checkpoint {
         bundle,
         average,
