@@ -44,6 +44,10 @@ pub struct Optimizer {
 }
 
 /// What is kept of a weight's gradients, flattened.
+#[allow(
+    clippy::large_enum_variant,
+    reason = "handles of tensors, a hundred of them"
+)]
 enum Memory {
     Adam(Moments),
     Muon(Tensor<1>),
