@@ -36,6 +36,18 @@ pub fn fan_in(name: &str, shape: &[usize]) -> usize {
     }
 }
 
+/// Outputs of a kernel; `None` for what is no kernel.
+///
+/// # Shapes
+/// As of [`fan_in`].
+pub fn outputs(name: &str, shape: &[usize]) -> Option<usize> {
+    match *shape {
+        [_, outputs, _, _] if is_deconvolution(name) => Some(outputs),
+        [outputs, _, _, _] => Some(outputs),
+        _ => None,
+    }
+}
+
 /// Whether a layer or weight is a deconvolution's, by its name: its first two axes are the other way round.
 pub(crate) fn is_deconvolution(name: &str) -> bool {
     name.contains("deconv")

@@ -12,6 +12,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use demc_model::dormant::{Dormant, Renewal};
 use demc_model::ops::adam::{Moments, Rule, sum_of_squares};
 use demc_model::ops::muon;
+use demc_model::weights::outputs;
 use demc_model::{Denoiser, Ops, Weight};
 
 use crate::config::TrainConfig;
@@ -211,7 +212,7 @@ impl Optimizer {
 
     /// Whether Muon moves the weight with this name and shape. The head's outputs are the image, no features: Adam's, as with Jordan et al.
     fn is_muons(&self, name: &str, shape: &[usize]) -> bool {
-        let outputs = muon::outputs(name, shape);
+        let outputs = outputs(name, shape);
         outputs.is_some_and(|outputs| outputs <= self.muon) && !name.starts_with(HEAD)
     }
 }

@@ -2,6 +2,7 @@
 
     pip install mitsuba numpy OpenEXR
     python python/render -o data/rooms --rooms 60                       furnished rooms out of nothing but a seed
+    python python/render -o data/stills --stills 60                     things on tables and squares, seen through a lens
     python python/render -o data/mine kitchen.xml hall.xml              your own Mitsuba scenes, each sensor a view
     python python/render -o data/rooms --rooms 60 --with data/sample    with another data set's scenes in the manifest
 
@@ -22,12 +23,15 @@ from pathlib import Path
 import numpy as np
 import views
 from rooms import Room
+from stills import Still
 from variant import mi
 
 NOISE = (0.2, 16.0)
 """RelMSE of a room's noisy image: cleaner teaches nothing, and what is worse at 4 samples nobody renders."""
-NEAR = 0.5
-"""Metres."""
+STILL_NOISE = (0.03, 16.0)
+"""Of a still life's, whose clean images teach to keep a texture."""
+NEAR, STILL_NEAR = 0.5, 0.15
+"""Metres, in a room and before a still life."""
 
 
 @dataclass
@@ -48,7 +52,8 @@ def main() -> None:
     budget = views.Budget(args.spp, args.ref_spp, args.residual)
     manifest = args.output / "manifest.json"
     left_out = json.loads(manifest.read_text()).get("left_out", {}) if manifest.exists() else {}
-    for base in [*own_scenes(args, budget), *furnished_rooms(args, replace(budget, noise=NOISE, near=NEAR))]:
+    rooms = furnished_rooms(args, replace(budget, noise=NOISE, near=NEAR))
+    for base in [*own_scenes(args, budget), *rooms, *still_lifes(args, replace(budget, noise=STILL_NOISE, near=STILL_NEAR))]:
         missing = [name for name in base.views if not (folder / f"{name}.exr").exists() and name not in left_out]
         scene = base.load() if missing else None
         for name in missing:
@@ -97,6 +102,22 @@ def furnished_rooms(args, budget: views.Budget) -> Iterator[Base]:
         yield Base(name, names, args.seed * 100003 + index * 16, budget, load)
 
 
+def still_lifes(args, budget: views.Budget) -> Iterator[Base]:
+    """Still lifes by number, as the rooms."""
+    for index in range(args.stills):
+
+        def load(index: int = index) -> mi.Scene:
+            rng = np.random.default_rng([args.seed, index, 4])
+            still = Still(rng, args.grain, np.random.default_rng([args.seed, index, 5]))
+            for view in range(args.views):
+                still.scene[f"camera{view}"] = still.camera(rng, args.size)
+            return mi.load_dict(still.scene)
+
+        name = f"still-{args.seed}-{index}"
+        names = [f"{name}-{view}" for view in range(args.views)]
+        yield Base(name, names, args.seed * 100003 + 50000 + index * 16, budget, load)
+
+
 def write_manifest(args, left_out: dict[str, str]) -> None:
     """Lists every scene that is there, and those of `--with`."""
     scenes = [views.entry_of(path) for path in sorted(args.output.glob("*/*.exr"))]
@@ -116,8 +137,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("scenes", nargs="*", type=Path, metavar="SCENE.xml", help="Mitsuba scenes to render")
     parser.add_argument("-o", "--output", required=True, type=Path, metavar="DIR", help="the data set; other images in it are kept")
     parser.add_argument("--rooms", type=int, default=0, metavar="N", help="rooms to render; each is its number and the seed")
-    parser.add_argument("--views", type=int, default=2, metavar="N", help="of each room [2]")
-    parser.add_argument("--size", type=int, default=224, metavar="PIXELS", help="both sides of a view of a room [224]")
+    parser.add_argument("--stills", type=int, default=0, metavar="N", help="still lifes to render; each is its number and the seed")
+    parser.add_argument("--views", type=int, default=2, metavar="N", help="of each room or still life [2]")
+    parser.add_argument("--size", type=int, default=224, metavar="PIXELS", help="both sides of their views [224]")
     parser.add_argument("--sun", type=float, default=0.6, metavar="SHARE", help="of the rooms with windows that the sun shines into [0.6]")
     parser.add_argument("--grain", type=float, default=0.6, metavar="SHARE", help="of the colours and patterns that are boards, stone or cloth [0.6]")
     parser.add_argument("--black", type=float, default=0.2, metavar="SHARE", help="of the rooms whose bars and blinds are black [0.2]")
@@ -128,8 +150,8 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--split", choices=("train", "test"), default="train", help="[train]")
     parser.add_argument("--with", dest="beside", action="append", default=[], type=Path, metavar="DIR", help="data set whose scenes are listed too")
     args = parser.parse_args()
-    if not args.scenes and args.rooms < 1:
-        parser.error("nothing to render: --rooms N, or SCENE.xml")
+    if not args.scenes and args.rooms < 1 and args.stills < 1:
+        parser.error("nothing to render: --rooms N, --stills N, or SCENE.xml")
     stems = [path.stem for path in args.scenes]
     if len(set(stems)) < len(stems):
         parser.error("two scenes have one name")

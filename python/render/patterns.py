@@ -18,8 +18,8 @@ def color(rng: Rng) -> list[float]:
     return [float(c) for c in colorsys.hsv_to_rgb(rng.random(), saturation, rng.uniform(0.1, 0.9))]
 
 
-def sky(rng: Rng, brightness: float) -> dict:
-    """An environment map: a gradient with clouds, and a sun of one or a few degrees in three of four."""
+def sky(rng: Rng, brightness: float, skyline: bool = False) -> dict:
+    """An environment map: a gradient with clouds, a sun of one or a few degrees in three of four, and buildings or trees before it."""
     height, width = 256, 512
     up = np.linspace(1, -1, height)[:, None, None]
     zenith = np.array([rng.uniform(0.5, 1), rng.uniform(0.7, 1), 1.0]) * rng.uniform(0.4, 1)
@@ -35,9 +35,30 @@ def sky(rng: Rng, brightness: float) -> dict:
         sun = (np.arccos(np.clip(cosine, -1, 1)) < radius)[..., None]
         power = np.exp(rng.uniform(np.log(0.02), np.log(0.5))) / (1 - np.cos(radius))
         image += sun * power * np.array([1, rng.uniform(0.75, 1), rng.uniform(0.5, 1)])
+    if skyline:
+        image = built(rng, image)
     # Mitsuba's maps have y up.
     to_world = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
     return {"type": "envmap", "bitmap": mi.Bitmap((image * brightness * 4).astype(np.float32)), "to_world": to_world}
+
+
+def built(rng: Rng, image: np.ndarray) -> np.ndarray:
+    """Blocks with windows along the horizon of an environment map, `[height, width, 3]`, and something coarse for the ground."""
+    height, width, _ = image.shape
+    image = image.copy()
+    horizon, left = height // 2, 0
+    bumps = noise(rng, height, width, 6)[..., None]
+    while left < width:
+        right = left + int(rng.integers(6, 60))
+        top = horizon - int(rng.integers(2, 60))
+        y, x = np.mgrid[top:horizon, left : min(right, width)]
+        across, up = rng.integers(3, 14, 2)
+        window = (x % across > across * rng.uniform(0.2, 0.7)) & (y % up > up * rng.uniform(0.2, 0.7))
+        wall, pane = (np.array(color(rng)) * rng.uniform(0.2, 1) for _ in range(2))
+        image[top:horizon, left:right] = np.where(window[..., None], pane, wall) * (0.5 + bumps[top:horizon, left:right])
+        left = right
+    image[horizon:] *= 0.4 + 1.2 * bumps[horizon:]
+    return image
 
 
 def noise(rng: Rng, height: int, width: int, octaves: int) -> np.ndarray:

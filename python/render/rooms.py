@@ -1,4 +1,4 @@
-"""Furnished rooms out of nothing but a seed: boxes, cylinders and spheres for furniture, patterns for textures, light through windows and from lamps.
+"""Furnished rooms out of nothing but a seed: patterns for textures, light through windows and from lamps.
 
 Lengths are metres, z is up, the floor is z = 0 and the room's corner the origin.
 """
@@ -6,24 +6,17 @@ Lengths are metres, z is up, the floor is z = 0 and the room's corner the origin
 from __future__ import annotations
 
 import numpy as np
-from patterns import TEXTURE_SIDE, Rng, color, grain, mosaic, pattern, sky
+from furniture import Furnished
+from patterns import Rng, mosaic, sky
 from variant import mi
 
-METALS = ("Al", "Ag", "Au", "Cu", "Cr", "W")
 
-
-class Room:
-    """One room: a Mitsuba scene that grows shape by shape.
-
-    A share of what it is painted with has a grain, by numbers of its own: all else is the same without.
-    """
+class Room(Furnished):
+    """One room."""
 
     def __init__(self, rng: Rng, grained: float = 0.0, grains: Rng | None = None) -> None:
-        self.rng, self.grained, self.grains = rng, grained, grains
         self.size = np.array([rng.uniform(3, 9), rng.uniform(3, 9), rng.uniform(2.3, 3.8)])
-        self.scene: dict = {"type": "scene"}
-        self.palette = [color(rng) for _ in range(6)]
-        self.materials = [self.material() for _ in range(rng.integers(6, 14))]
+        super().__init__(rng, grained, grains)
         self.targets: list[np.ndarray] = []
         self.frames: list[dict] = []
         """What bars, blinds and curtains are made of."""
@@ -36,68 +29,6 @@ class Room:
         if not windows or rng.random() < 0.35:
             self.lamps()
         self.furnish()
-
-    # Materials.
-
-    def tint(self) -> list[float]:
-        """One of the room's own colours, or any."""
-        return self.palette[self.rng.integers(len(self.palette))] if self.rng.random() < 0.7 else color(self.rng)
-
-    def paint(self) -> dict:
-        """A colour, or a pattern of two."""
-        grained = self.grains is not None and self.grains.random() < self.grained
-        if self.rng.random() < 0.45:
-            tint = self.tint()
-            if not grained:
-                return {"type": "rgb", "value": tint}
-            image = np.full((TEXTURE_SIDE, TEXTURE_SIDE, 3), tint)
-            scale = float(np.exp(self.grains.uniform(np.log(0.5), np.log(3))))
-        else:
-            image = pattern(self.rng, np.array(self.tint()), np.array(self.tint()))
-            scale = float(np.exp(self.rng.uniform(np.log(0.7), np.log(6))))
-        if grained:
-            image = np.clip(image * grain(self.grains), 0.005, 0.95)
-        transform = mi.ScalarTransform3f().scale([scale, scale])
-        return {"type": "bitmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "raw": True, "to_uv": transform}
-
-    def material(self, plain: bool = False) -> dict:
-        rng = self.rng
-        kind = 0.0 if plain else rng.random()
-        roughness = float(rng.uniform(0.05, 0.5))
-        if kind < 0.62:
-            surface = {"type": "diffuse", "reflectance": self.paint()}
-        elif kind < 0.84:
-            surface = {"type": "roughplastic", "diffuse_reflectance": self.paint(), "alpha": roughness, "nonlinear": True}
-        elif kind < 0.93:
-            surface = {"type": "roughconductor", "material": str(rng.choice(METALS)), "alpha": roughness}
-        elif kind < 0.96:
-            surface = {"type": "conductor", "material": str(rng.choice(METALS))}
-        else:
-            return {"type": "dielectric"}
-        return {"type": "twosided", "bsdf": surface}
-
-    def any_material(self) -> dict:
-        return self.materials[self.rng.integers(len(self.materials))]
-
-    # Shapes.
-
-    def add(self, shape: dict, bsdf: dict | None = None) -> None:
-        if bsdf is not None:
-            shape["bsdf"] = bsdf
-        self.scene[f"shape{len(self.scene)}"] = shape
-
-    def box(self, low, high, bsdf: dict, place: mi.ScalarTransform4f | None = None) -> None:
-        low, high = np.asarray(low, float), np.asarray(high, float)
-        to_world = (place or mi.ScalarTransform4f()).translate(((low + high) / 2).tolist()).scale(((high - low) / 2).tolist())
-        self.add({"type": "cube", "to_world": to_world}, bsdf)
-
-    def rod(self, start, end, radius: float, bsdf: dict, place: mi.ScalarTransform4f | None = None) -> None:
-        p0, p1 = ([float(v) for v in p] for p in (start, end))
-        self.add({"type": "cylinder", "p0": p0, "p1": p1, "radius": float(radius), "to_world": place or mi.ScalarTransform4f()}, bsdf)
-
-    def ball(self, center, radius: float, bsdf: dict, place: mi.ScalarTransform4f | None = None) -> None:
-        shape = {"type": "sphere", "center": [float(v) for v in center], "radius": float(radius)}
-        self.add(shape | {"to_world": place or mi.ScalarTransform4f()}, bsdf)
 
     # The shell.
 
@@ -237,109 +168,9 @@ class Room:
             kinds[rng.integers(len(kinds))](place)
             self.targets.append(np.array([*at, rng.uniform(0.2, 1.2)]))
 
-    def table(self, place, small: bool = False) -> None:
-        rng, wood = self.rng, self.any_material()
-        w, d, h = rng.uniform(0.3, 0.45 if small else 1.0), rng.uniform(0.25, 0.35 if small else 0.6), rng.uniform(0.4, 0.8)
-        self.box([-w, -d, h - 0.03], [w, d, h], wood, place)
-        legs = self.any_material() if rng.random() < 0.4 else wood
-        for sx in (-1, 1):
-            for sy in (-1, 1):
-                foot = [sx * (w - 0.05), sy * (d - 0.05)]
-                self.rod([*foot, 0], [*foot, h - 0.03], rng.uniform(0.015, 0.04), legs, place)
-        for _ in range(rng.integers(0, 3 if small else 9)):
-            self.thing(place.translate([float(rng.uniform(-0.8, 0.8) * w), float(rng.uniform(-0.8, 0.8) * d), float(h)]))
-
-    def chair(self, place) -> None:
-        rng, wood = self.rng, self.any_material()
-        w, h, back = 0.22, rng.uniform(0.4, 0.5), rng.uniform(0.8, 1.1)
-        self.box([-w, -w, h - 0.04], [w, w, h], self.any_material() if rng.random() < 0.5 else wood, place)
-        for sx in (-1, 1):
-            self.rod([sx * (w - 0.03), w - 0.03, 0], [sx * (w - 0.03), w - 0.03, h], 0.018, wood, place)
-            self.rod([sx * (w - 0.03), -w + 0.03, 0], [sx * (w - 0.03), -w + 0.03, back], 0.018, wood, place)
-        if rng.random() < 0.5:
-            for z in np.linspace(h + 0.12, back - 0.02, rng.integers(2, 5)):
-                self.box([-w, -w + 0.01, z - 0.03], [w, -w + 0.04, z + 0.03], wood, place)
-        else:
-            for x in np.linspace(-w + 0.06, w - 0.06, rng.integers(3, 7)):
-                self.rod([x, -w + 0.03, h], [x, -w + 0.03, back], 0.01, wood, place)
-            self.box([-w, -w + 0.01, back - 0.05], [w, -w + 0.05, back], wood, place)
-
-    def shelf(self, place) -> None:
-        rng, wood = self.rng, self.any_material()
-        w, d, h = rng.uniform(0.3, 0.8), 0.16, rng.uniform(0.8, 2.1)
-        boards = int(rng.integers(3, 7))
-        for sx in (-w, w):
-            self.box([sx - 0.015, -d, 0], [sx + 0.015, d, h], wood, place)
-        for z in np.linspace(0.05, h, boards):
-            self.box([-w, -d, z - 0.012], [w, d, z + 0.012], wood, place)
-        if rng.random() < 0.7:
-            self.box([-w, -d - 0.01, 0], [w, -d, h], wood, place)
-        gap = (h - 0.05) / (boards - 1)
-        for z in np.linspace(0.05, h, boards)[:-1]:
-            x = -w + 0.03
-            while x < w - 0.1 and rng.random() < 0.93:
-                thick = rng.uniform(0.02, 0.07)
-                self.box([x, -d + 0.02, z + 0.012], [x + thick, rng.uniform(0, d), z + gap * rng.uniform(0.5, 0.9)], self.any_material(), place)
-                x += thick + (rng.uniform(0, 0.15) if rng.random() < 0.2 else 0.002)
-
-    def sofa(self, place) -> None:
-        rng, cloth = self.rng, self.any_material()
-        w = rng.uniform(0.4, 1.1)
-        self.box([-w, -0.4, 0.12], [w, 0.4, 0.42], cloth, place)
-        self.box([-w, -0.45, 0.12], [w, -0.25, 0.85], cloth, place)
-        for sx in (-w - 0.08, w + 0.08):
-            self.box([sx - 0.09, -0.45, 0.05], [sx + 0.09, 0.4, 0.6], cloth, place)
-        for _ in range(rng.integers(0, 4)):
-            leaning = place.translate([float(rng.uniform(-w, w) * 0.8), -0.15, 0.58]).rotate([1, 0, 0], 20).rotate([0, 1, 0], float(rng.uniform(-20, 20)))
-            self.box([-0.18, -0.06, -0.16], [0.18, 0.06, 0.16], self.any_material(), leaning)
-
-    def heap(self, place) -> None:
-        """Boxes over each other."""
-        rng, z = self.rng, 0.0
-        side = rng.uniform(0.2, 0.6)
-        for _ in range(rng.integers(1, 5)):
-            h = rng.uniform(0.08, 0.5)
-            turned = place.rotate([0, 0, 1], float(rng.normal(0, 15)))
-            self.box([-side, -side * 0.7, z], [side, side * 0.7, z + h], self.any_material(), turned)
-            z, side = z + h, side * rng.uniform(0.6, 1)
-        self.thing(place.translate([0, 0, z]))
-
-    def plant(self, place) -> None:
-        rng = self.rng
-        green = [float(v) for v in rng.uniform([0.03, 0.15, 0.02], [0.3, 0.5, 0.15])]
-        leaf = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": green}}}
-        h, r = rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.22)
-        self.rod([0, 0, 0], [0, 0, h], r, self.any_material(), place)
-        self.add({"type": "disk", "to_world": place.translate([0, 0, float(h)]).scale([float(r), float(r), 1])}, self.any_material())
-        for _ in range(rng.integers(20, 70)):
-            out = place.translate([0, 0, float(h)]).rotate([0, 0, 1], float(rng.uniform(0, 360))).rotate([0, 1, 0], float(rng.uniform(-80, 10)))
-            length, width = float(rng.uniform(0.1, 0.35)), float(rng.uniform(0.02, 0.07))
-            self.add({"type": "rectangle", "to_world": out.translate([length * 1.3, 0, 0]).rotate([1, 0, 0], float(rng.uniform(-40, 40))).scale([length, width, 1])}, leaf)
-
-    def rug(self, place) -> None:
-        w, d = self.rng.uniform(0.5, 1.6, 2)
-        self.box([-w, -d, 0], [w, d, 0.012], self.material(plain=True), place)
-
     def post(self, place) -> None:
         r = self.rng.uniform(0.03, 0.3)
         self.rod([0, 0, 0], [0, 0, self.size[2]], r, self.any_material(), place)
-
-    def thing(self, place) -> None:
-        """Something to stand on a table."""
-        rng, bsdf, kind = self.rng, self.any_material(), self.rng.integers(5)
-        r, h = rng.uniform(0.03, 0.1), rng.uniform(0.06, 0.3)
-        if kind == 0:
-            self.ball([0, 0, r], r, bsdf, place)
-        elif kind == 1:
-            self.rod([0, 0, 0], [0, 0, h], r * 0.6, bsdf, place)
-        elif kind == 2:
-            self.box([-r, -r * 1.4, 0], [r, r * 1.4, h * 0.3], bsdf, place.rotate([0, 0, 1], float(rng.uniform(0, 90))))
-        elif kind == 3:
-            self.ball([0, 0, r], r, bsdf, place)
-            self.rod([0, 0, r], [0, 0, r + h], r * 0.25, bsdf, place)
-        else:
-            for i in range(rng.integers(2, 6)):
-                self.box([-r, -r * 1.3, i * 0.025], [r, r * 1.3, i * 0.025 + 0.022], self.any_material(), place.rotate([0, 0, 1], float(rng.normal(0, 20))))
 
     # Views.
 

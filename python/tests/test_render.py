@@ -152,12 +152,56 @@ class Render(unittest.TestCase):
         kinds = [[texture["type"] for texture in textures(room.scene)] for room in (plain, grained)]
         self.assertGreater(kinds[1].count("bitmap"), kinds[0].count("bitmap"))
 
+    def test_a_turned_surface_is_closed_and_faces_outwards(self) -> None:
+        import mitsuba as mi
+        import numpy as np
+        import stills
+
+        still = stills.Still(np.random.default_rng(1))
+        place = mi.ScalarTransform4f().translate([1, 2, 0]).rotate([0, 0, 1], 30)
+        still.turned(np.array([0, 0.1, 0.1, 0]), np.array([0, 0, 0.3, 0.3]), place)
+        *_, mesh = still.scene.values()
+        parameters = mi.traverse(mesh)
+        points = np.array(parameters["vertex_positions"]).reshape(-1, 3)
+        np.testing.assert_allclose(points.min(0), [0.9, 1.9, 0], atol=1e-3)
+        np.testing.assert_allclose(points.max(0), [1.1, 2.1, 0.3], atol=1e-3)
+        a, b, c = points[np.array(parameters["faces"]).reshape(-1, 3).T].astype(float) - [1, 2, 0]
+        # By the divergence theorem; glass needs to know which side is in.
+        volume = np.einsum("ij,ij", a, np.cross(b, c)) / 6
+        polygon = stills.SEGMENTS / 2 * 0.1**2 * np.sin(2 * np.pi / stills.SEGMENTS)
+        self.assertAlmostEqual(volume, polygon * 0.3, places=6)
+
+    def test_a_lens_blurs_what_is_out_of_its_focus(self) -> None:
+        import mitsuba as mi
+        import numpy as np
+        import tracer
+        from stills import Still
+
+        lenses, between = [], []
+        for seed in range(12):
+            still = Still(np.random.default_rng(seed))
+            camera = still.camera(np.random.default_rng(seed), SIDE)
+            lenses.append(camera["type"])
+            if camera["type"] == "thinlens":
+                scene = mi.load_dict(still.scene | {"as it is": camera, "wide": camera | {"aperture_radius": 10 * camera["aperture_radius"]}})
+                masks = (tracer.render(scene, 16, 1, view=view).features["mask"] / 16 for view in range(2))
+                # Pixels on the edge of what is hit.
+                between.append([((0 < mask) & (mask < 1)).sum() for mask in masks])
+        self.assertEqual(set(lenses), {"thinlens", "perspective"})
+        sharp, wide = np.sum(between, axis=0)
+        self.assertGreater(wide, 1.5 * sharp)
+
     def test_a_data_set_is_the_same_for_one_seed_and_goes_on_where_it_stopped(self) -> None:
+        for kind in ("--rooms", "--stills"):
+            with self.subTest(kind):
+                self.goes_on(kind)
+
+    def goes_on(self, kind: str) -> None:
         import numpy as np
         import views
 
         with tempfile.TemporaryDirectory() as folder:
-            ask = ("--rooms", 1, "--views", 2, "--size", 32, "--ref-spp", 32)
+            ask = (kind, 1, "--views", 2, "--size", 32, "--ref-spp", 32)
             first, second = Path(folder) / "first", Path(folder) / "second"
             for out in (first, second):
                 ended = run("-o", out, *ask)

@@ -8,19 +8,10 @@ use burn::optim::momentum::MomentumConfig;
 use burn::optim::{AdjustLrFn, MuonConfig, Optimizer};
 use burn::tensor::Tensor;
 
-use crate::weights::{fan_in, is_deconvolution};
+use crate::weights::{fan_in, is_deconvolution, outputs};
 
 /// What a step keeps of the sum of gradients (Jordan et al.'s).
 const MOMENTUM: f64 = 0.95;
-
-/// Outputs of a kernel: the rows of its matrix. `None` for what is no kernel.
-pub fn outputs(name: &str, shape: &[usize]) -> Option<usize> {
-    match *shape {
-        [_, outputs, _, _] if is_deconvolution(name) => Some(outputs),
-        [outputs, _, _, _] => Some(outputs),
-        _ => None,
-    }
-}
 
 /// The kernel `name` after a step, with the sum of its gradients so far, flattened; `None` before the first step.
 ///
@@ -73,21 +64,13 @@ struct Layout {
 
 impl Layout {
     fn of(name: &str, shape: &[usize]) -> Self {
-        let &[first, second, height, width] = shape else {
+        let Some(rows) = outputs(name, shape) else {
             panic!("{name} has {} axes, a kernel has four", shape.len())
         };
-        let taps = height * width;
-        match is_deconvolution(name) {
-            true => Layout {
-                rows: second,
-                columns: first * taps,
-                turned: Some([first, taps]),
-            },
-            false => Layout {
-                rows: first,
-                columns: second * taps,
-                turned: None,
-            },
+        Layout {
+            rows,
+            columns: shape.iter().product::<usize>() / rows,
+            turned: is_deconvolution(name).then(|| [shape[0], shape[2] * shape[3]]),
         }
     }
 

@@ -1,0 +1,84 @@
+"""A Mitsuba scene that grows shape by shape, and what it is painted with."""
+
+from __future__ import annotations
+
+import numpy as np
+from patterns import TEXTURE_SIDE, Rng, color, grain, pattern
+from variant import mi
+
+METALS = ("Al", "Ag", "Au", "Cu", "Cr", "W")
+
+
+class Stage:
+    """Materials to choose from, and shapes made of them.
+
+    A share of what it is painted with has a grain, by numbers of its own: all else is the same without.
+    """
+
+    def __init__(self, rng: Rng, grained: float = 0.0, grains: Rng | None = None) -> None:
+        self.rng, self.grained, self.grains = rng, grained, grains
+        self.scene: dict = {"type": "scene"}
+        self.palette = [color(rng) for _ in range(6)]
+        self.materials = [self.material() for _ in range(rng.integers(6, 14))]
+
+    # Materials.
+
+    def tint(self) -> list[float]:
+        """One of the room's own colours, or any."""
+        return self.palette[self.rng.integers(len(self.palette))] if self.rng.random() < 0.7 else color(self.rng)
+
+    def paint(self) -> dict:
+        """A colour, or a pattern of two."""
+        grained = self.grains is not None and self.grains.random() < self.grained
+        if self.rng.random() < 0.45:
+            tint = self.tint()
+            if not grained:
+                return {"type": "rgb", "value": tint}
+            image = np.full((TEXTURE_SIDE, TEXTURE_SIDE, 3), tint)
+            scale = float(np.exp(self.grains.uniform(np.log(0.5), np.log(3))))
+        else:
+            image = pattern(self.rng, np.array(self.tint()), np.array(self.tint()))
+            scale = float(np.exp(self.rng.uniform(np.log(0.7), np.log(6))))
+        if grained:
+            image = np.clip(image * grain(self.grains), 0.005, 0.95)
+        transform = mi.ScalarTransform3f().scale([scale, scale])
+        return {"type": "bitmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "raw": True, "to_uv": transform}
+
+    def material(self, plain: bool = False) -> dict:
+        rng = self.rng
+        kind = 0.0 if plain else rng.random()
+        roughness = float(rng.uniform(0.05, 0.5))
+        if kind < 0.62:
+            surface = {"type": "diffuse", "reflectance": self.paint()}
+        elif kind < 0.84:
+            surface = {"type": "roughplastic", "diffuse_reflectance": self.paint(), "alpha": roughness, "nonlinear": True}
+        elif kind < 0.93:
+            surface = {"type": "roughconductor", "material": str(rng.choice(METALS)), "alpha": roughness}
+        elif kind < 0.96:
+            surface = {"type": "conductor", "material": str(rng.choice(METALS))}
+        else:
+            return {"type": "dielectric"}
+        return {"type": "twosided", "bsdf": surface}
+
+    def any_material(self) -> dict:
+        return self.materials[self.rng.integers(len(self.materials))]
+
+    # Shapes.
+
+    def add(self, shape: dict, bsdf: dict | None = None) -> None:
+        if bsdf is not None:
+            shape["bsdf"] = bsdf
+        self.scene[f"shape{len(self.scene)}"] = shape
+
+    def box(self, low, high, bsdf: dict, place: mi.ScalarTransform4f | None = None) -> None:
+        low, high = np.asarray(low, float), np.asarray(high, float)
+        to_world = (place or mi.ScalarTransform4f()).translate(((low + high) / 2).tolist()).scale(((high - low) / 2).tolist())
+        self.add({"type": "cube", "to_world": to_world}, bsdf)
+
+    def rod(self, start, end, radius: float, bsdf: dict, place: mi.ScalarTransform4f | None = None) -> None:
+        p0, p1 = ([float(v) for v in p] for p in (start, end))
+        self.add({"type": "cylinder", "p0": p0, "p1": p1, "radius": float(radius), "to_world": place or mi.ScalarTransform4f()}, bsdf)
+
+    def ball(self, center, radius: float, bsdf: dict, place: mi.ScalarTransform4f | None = None) -> None:
+        shape = {"type": "sphere", "center": [float(v) for v in center], "radius": float(radius)}
+        self.add(shape | {"to_world": place or mi.ScalarTransform4f()}, bsdf)
