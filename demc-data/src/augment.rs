@@ -2,7 +2,8 @@
 //! the paper's preset (Sec. 4.2 names none).
 //!
 //! Flips and transposes move pixels: normals and positions are world-space values of a pixel, so they move with it and
-//! keep their numbers. A permutation of red, green and blue is the same for colour, textures and reference, an
+//! keep their numbers. Axes are what makes these numbers: which of them points up, and which way, is a renderer's choice (some say y, some z), so
+//! normals and positions may be told in other axes, the same for both. A permutation of red, green and blue is the same for colour, textures and reference, an
 //! exposure the same for colour and reference: light transport is linear in both. A crop is a patch of the same scene that
 //! need not lie on the grid: the network halves its input five times, and what is on the grid is always halved alike. Noise is drawn anew from the pixels of
 //! the same surface ([`crate::resample`]).
@@ -16,8 +17,8 @@ use crate::seed::{Use, generator};
 /// An exposure is drawn between minus and plus so many stops (factors of 2); ours.
 const EXPOSURE_STOPS: f32 = 1.0;
 
-/// The orders of red, green and blue.
-const RGB_ORDERS: [[usize; 3]; 6] = [
+/// The orders of three: of red, green and blue, or of the world's axes.
+const ORDERS: [[usize; 3]; 6] = [
     [0, 1, 2],
     [0, 2, 1],
     [1, 0, 2],
@@ -27,7 +28,7 @@ const RGB_ORDERS: [[usize; 3]; 6] = [
 ];
 
 /// Which augmentations are drawn. In a configuration: `true` (all), `false`, or a list of `"flip"`, `"transpose"`, `"rgb"`,
-/// `"exposure"`, `"crop"` and `"noise"`.
+/// `"exposure"`, `"axes"`, `"crop"` and `"noise"`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "Setting", into = "Setting")]
 pub struct Augment {
@@ -39,6 +40,8 @@ pub struct Augment {
     pub rgb: bool,
     /// Multiply colour and reference by `2^u`, u uniform from -1 to 1.
     pub exposure: bool,
+    /// Permute and mirror the world's axes in normals and positions, each of the 48 ways equally often.
+    pub axes: bool,
     /// Cut the patch anywhere in its scene, not on the grid.
     pub crop: bool,
     /// Give pixels the noise of others nearby that are like them ([`crate::resample`]).
@@ -48,7 +51,7 @@ pub struct Augment {
 #[derive(Serialize, Deserialize)]
 #[serde(
     untagged,
-    expecting = "augment must be true, false or a list of \"flip\", \"transpose\", \"rgb\", \"exposure\", \"crop\" and \"noise\""
+    expecting = "augment must be true, false or a list of \"flip\", \"transpose\", \"rgb\", \"exposure\", \"axes\", \"crop\" and \"noise\""
 )]
 enum Setting {
     All(bool),
@@ -62,15 +65,17 @@ enum Kind {
     Transpose,
     Rgb,
     Exposure,
+    Axes,
     Crop,
     Noise,
 }
 
-const KINDS: [Kind; 6] = [
+const KINDS: [Kind; 7] = [
     Kind::Flip,
     Kind::Transpose,
     Kind::Rgb,
     Kind::Exposure,
+    Kind::Axes,
     Kind::Crop,
     Kind::Noise,
 ];
@@ -82,6 +87,7 @@ impl Augment {
             Kind::Transpose => self.transpose,
             Kind::Rgb => self.rgb,
             Kind::Exposure => self.exposure,
+            Kind::Axes => self.axes,
             Kind::Crop => self.crop,
             Kind::Noise => self.noise,
         }
@@ -93,6 +99,7 @@ impl Augment {
             transpose: kinds.contains(&Kind::Transpose),
             rgb: kinds.contains(&Kind::Rgb),
             exposure: kinds.contains(&Kind::Exposure),
+            axes: kinds.contains(&Kind::Axes),
             crop: kinds.contains(&Kind::Crop),
             noise: kinds.contains(&Kind::Noise),
         }
@@ -132,6 +139,10 @@ pub struct Variation {
     pub rgb: [usize; 3],
     /// Factor on colour and reference.
     pub exposure: f32,
+    /// Which axis of the world becomes x, y and z.
+    pub axes: [usize; 3],
+    /// Which of x, y and z then point the other way.
+    pub mirrored: [bool; 3],
     /// What other noise is drawn from, if it is another one.
     pub noise: Option<u64>,
 }
@@ -142,17 +153,21 @@ impl Augment {
         let mut rng = generator(Use::Augment, seed, epoch, position);
         // All are drawn, whatever is on: switching one off leaves the others as they were.
         let bits = rng.next_u32();
-        let order = RGB_ORDERS[rng.random_range(0..RGB_ORDERS.len())];
+        let order = ORDERS[rng.random_range(0..ORDERS.len())];
         let stops = rng.random_range(-EXPOSURE_STOPS..EXPOSURE_STOPS);
         let noise = rng.next_u64();
         let crop = [rng.random(), rng.random()];
+        let axes = ORDERS[rng.random_range(0..ORDERS.len())];
+        let mirrored = rng.random();
         Variation {
             crop: self.crop.then_some(crop),
             flip_x: self.flip && bits & 1 != 0,
             flip_y: self.flip && bits & 2 != 0,
             transpose: self.transpose && bits & 4 != 0,
-            rgb: if self.rgb { order } else { RGB_ORDERS[0] },
+            rgb: if self.rgb { order } else { ORDERS[0] },
             exposure: if self.exposure { stops.exp2() } else { 1.0 },
+            axes: if self.axes { axes } else { ORDERS[0] },
+            mirrored: if self.axes { mirrored } else { [false; 3] },
             noise: self.noise.then_some(noise),
         }
     }
@@ -209,6 +224,8 @@ mod tests {
         transpose: false,
         rgb: [0, 1, 2],
         exposure: 1.0,
+        axes: [0, 1, 2],
+        mirrored: [false; 3],
         noise: None,
     };
     const TURNS: Augment = Augment {
@@ -216,6 +233,7 @@ mod tests {
         transpose: true,
         rgb: false,
         exposure: false,
+        axes: false,
         crop: false,
         noise: false,
     };
@@ -273,7 +291,7 @@ mod tests {
     fn every_order_of_rgb_and_the_whole_range_of_exposures_are_drawn() {
         let all = Augment::of(&KINDS);
         let drawn: Vec<Variation> = (0..300).map(|position| all.draw(1, 2, position)).collect();
-        for order in RGB_ORDERS {
+        for order in ORDERS {
             let count = drawn.iter().filter(|v| v.rgb == order).count();
             // 50 expected, deviation 6.5.
             assert!((20..80).contains(&count), "{order:?}: {count}");
@@ -283,6 +301,23 @@ mod tests {
             (a.min(e), b.max(e))
         });
         assert!((0.5..0.55).contains(&least) && (1.8..2.0).contains(&most));
+    }
+
+    #[test]
+    fn every_way_to_tell_the_axes_is_drawn() {
+        let axes = Augment::of(&[Kind::Axes]);
+        let drawn: Vec<_> = (0..2400)
+            .map(|position| axes.draw(1, 2, position))
+            .map(|v| (v.axes, v.mirrored))
+            .collect();
+        for order in ORDERS {
+            for bits in 0..8 {
+                let mirrored = [0, 1, 2].map(|axis| bits >> axis & 1 != 0);
+                let count = drawn.iter().filter(|v| **v == (order, mirrored)).count();
+                // 50 expected, deviation 7.
+                assert!((20..85).contains(&count), "{order:?} {mirrored:?}: {count}");
+            }
+        }
     }
 
     /// A patch of 32 in a scene of 36 x 34 has five rows and three columns to begin in.
@@ -346,7 +381,7 @@ mod tests {
         let error = toml::from_str::<Table>("augment = [\"rotate\"]").expect_err("unknown");
         assert!(
             error.message().contains(
-                "a list of \"flip\", \"transpose\", \"rgb\", \"exposure\", \"crop\" and \"noise\""
+                "a list of \"flip\", \"transpose\", \"rgb\", \"exposure\", \"axes\", \"crop\" and \"noise\""
             ),
             "{error}"
         );

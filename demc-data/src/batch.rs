@@ -179,15 +179,17 @@ impl PatchSource {
         let reference = from.reference.as_ref().expect("it is read as required");
         let (patch, size) = (place.draw.patch, self.patch_size);
         let variation = place.draw.variation;
+        let rgb = variation.rgb;
         for (planes, out, order) in [
-            (&from.color[..], &mut *place.color, rgb_order(0, variation)),
+            (&from.color[..], &mut *place.color, rgb.to_vec()),
             (&from.features, place.features, feature_order(variation)),
-            (reference, place.reference, rgb_order(0, variation)),
+            (reference, place.reference, rgb.to_vec()),
         ] {
             let planes = order.iter().map(|plane| &planes[*plane]);
             cut_planes(planes, from.width, patch, size, out);
             variation.turn(out, size);
         }
+        mirror(place.features, variation.mirrored, size * size);
         if let Some(seed) = variation.noise {
             resample_noise(place.color, place.features, place.reference, size, seed);
         }
@@ -201,17 +203,29 @@ impl PatchSource {
     }
 }
 
-/// Which planes become red, green and blue, of three that begin at `first`.
-fn rgb_order(first: usize, variation: Variation) -> Vec<usize> {
-    variation.rgb.map(|channel| first + channel).to_vec()
+/// Which planes become the channels `order`, of three that begin at `first`.
+fn three(first: usize, order: [usize; 3]) -> [usize; 3] {
+    order.map(|channel| first + channel)
 }
 
-/// Which planes become the features: normals and positions as they are, textures permuted.
+/// Which planes become the features: normals and positions in the order of the axes, textures in that of red, green and blue.
 fn feature_order(variation: Variation) -> Vec<usize> {
-    let textures = [TEXTURES, TEXTURES + 3].map(|first| rgb_order(first, variation));
-    (0..TEXTURES)
-        .chain(textures.into_iter().flatten())
+    let Variation { axes, rgb, .. } = variation;
+    let orders = [(0, axes), (3, axes), (TEXTURES, rgb), (TEXTURES + 3, rgb)];
+    orders
+        .into_iter()
+        .flat_map(|(first, order)| three(first, order))
         .collect()
+}
+
+/// Turns axes of normals and positions round.
+fn mirror(features: &mut [f32], mirrored: [bool; 3], pixels: usize) {
+    let vectors = features[..TEXTURES * pixels].chunks_exact_mut(pixels);
+    for (plane, mirrored) in vectors.zip(mirrored.into_iter().cycle()) {
+        if mirrored {
+            plane.iter_mut().for_each(|value| *value = -*value);
+        }
+    }
 }
 
 /// Copies a patch of every plane to `out`, `[planes, size, size]`.

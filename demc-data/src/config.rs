@@ -61,7 +61,7 @@ pub struct DataConfig {
     pub batch_size: usize,
     /// Share of the training split's base scenes that is held out for validation, 0 to below 1.
     pub validation: f64,
-    /// Augmentation: `true` (all), `false` or a list of `"flip"`, `"transpose"`, `"rgb"`, `"exposure"`, `"crop"` and `"noise"`.
+    /// Augmentation: `true` (all), `false` or a list of `"flip"`, `"transpose"`, `"rgb"`, `"exposure"`, `"axes"`, `"crop"` and `"noise"`.
     pub augment: Augment,
     /// Filter the training scenes' references ([`crate::reference_filter`]): for references with visible noise.
     pub reference_filter: bool,

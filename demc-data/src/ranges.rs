@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::frame::{FEATURES, Frame};
+use crate::frame::{FEATURES, Frame, TEXTURES};
 use crate::stats::{Moments, hit_samples};
 
 /// Rec. 709 luminance of red, green and blue.
@@ -107,6 +107,27 @@ impl Ranges {
         }
     }
 
+    /// These, of scenes that were shown with their axes told in all ways ([`crate::Augment::axes`]): each axis of normals and positions has been
+    /// any other, pointing either way.
+    pub fn in_any_axes(&self) -> Self {
+        let (mut mean, mut std) = (self.mean, self.std);
+        let axes = mean[..TEXTURES].chunks_mut(3);
+        for (mean, std) in axes.zip(std[..TEXTURES].chunks_mut(3)) {
+            let farthest = mean.iter().map(|range| range.high.max(-range.low));
+            let farthest = farthest.fold(0.0, f32::max);
+            mean.fill(Range {
+                low: -farthest,
+                high: farthest,
+            });
+            std.fill(std[0].with(std[1]).with(std[2]));
+        }
+        Self {
+            exposure: self.exposure,
+            mean,
+            std,
+        }
+    }
+
     /// These and those of the scenes that the same weights saw before.
     pub fn with(&self, before: &Ranges) -> Self {
         let both = |a: &[Range; FEATURES], b: &[Range; FEATURES]| {
@@ -162,6 +183,22 @@ mod tests {
         assert!((ends(both.exposure)[1] - 1.0).abs() < 1e-6);
         assert_eq!(ends(both.mean[3]), [1.5, 3.5]);
         assert_eq!(ends(both.std[3]), [0.5, 0.5]);
+    }
+
+    #[test]
+    fn in_any_axes_each_of_them_may_be_any_other() {
+        let mut ranges = Ranges::of(&[Summary::of(&frame(0.25, 3.0))]);
+        let textures = ranges.clone();
+        let range = |low, high| Range { low, high };
+        ranges.mean[3..6].copy_from_slice(&[range(-7.0, 1.0), range(2.0, 3.0), range(0.0, 5.0)]);
+        ranges.std[3..6].copy_from_slice(&[range(1.0, 2.0), range(0.5, 0.7), range(3.0, 4.0)]);
+        let any = ranges.in_any_axes();
+        assert_eq!(any.mean[3..6], [range(-7.0, 7.0); 3]);
+        assert_eq!(any.std[3..6], [range(0.5, 4.0); 3]);
+        assert_eq!(any.mean[0], range(-3.5, 3.5));
+        assert_eq!(any.mean[6..], textures.mean[6..]);
+        assert_eq!(any.std[6..], textures.std[6..]);
+        assert_eq!(any.exposure, textures.exposure);
     }
 
     #[test]

@@ -49,6 +49,7 @@ fn batches_are_the_same_for_any_number_of_workers() {
             transpose: true,
             rgb: true,
             exposure: true,
+            axes: true,
             crop: true,
             noise: true,
         },
@@ -262,6 +263,54 @@ fn rgb_and_exposure_change_what_they_should_alike() {
         orders.insert(order);
     }
     assert!(orders.len() > 1, "seven patches, six orders: {orders:?}");
+}
+
+/// One order and one sign an axis for normals and positions; all else stays.
+#[test]
+fn axes_are_told_in_other_ways_the_same_for_normals_and_positions() {
+    let plain = source(&small()).batch(0).expect("the sample is sound");
+    let varied = source(&DataConfig {
+        augment: Augment {
+            axes: true,
+            ..Augment::default()
+        },
+        ..small()
+    });
+    let varied = varied.batch(0).expect("the sample is sound");
+    assert_eq!(plain.color_gamma, varied.color_gamma);
+    assert_eq!(plain.reference_hdr, varied.reference_hdr);
+    let pixels = 64 * 64;
+    let features = |batch: &Batch| -> Vec<Vec<f32>> {
+        let planes = batch.features_z.chunks(pixels);
+        planes.map(<[f32]>::to_vec).collect()
+    };
+    let (before, after) = (features(&plain), features(&varied));
+    let (mut ways, mut mirrored) = (HashSet::new(), HashSet::new());
+    for (before, after) in before.chunks(FEATURES).zip(after.chunks(FEATURES)) {
+        assert_eq!(before[6..], after[6..], "textures");
+        let way_of = |first: usize| -> Vec<(usize, bool)> {
+            let axis = |plane: &Vec<f32>| {
+                let matches = |sign: f32, from: &Vec<f32>| {
+                    from.iter().zip(plane).all(|(a, b)| a * sign == *b)
+                };
+                let found = (0..3).find_map(|from| {
+                    let of = &before[first + from];
+                    [false, true]
+                        .into_iter()
+                        .find(|turned| matches(if *turned { -1.0 } else { 1.0 }, of))
+                        .map(|turned| (from, turned))
+                });
+                found.expect("it is one of the axes")
+            };
+            after[first..first + 3].iter().map(axis).collect()
+        };
+        let way = way_of(3);
+        assert_eq!(way_of(0), way, "normals as positions");
+        mirrored.extend(way.iter().map(|(_, turned)| *turned));
+        ways.insert(way);
+    }
+    assert!(ways.len() > 2, "seven patches, 48 ways: {ways:?}");
+    assert_eq!(mirrored.len(), 2);
 }
 
 #[test]

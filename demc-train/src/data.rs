@@ -58,7 +58,10 @@ impl Data {
             validation,
             test,
             normalizer: statistics.normalizer,
-            ranges: statistics.ranges,
+            ranges: match config.augment.axes {
+                true => statistics.ranges.in_any_axes(),
+                false => statistics.ranges,
+            },
             clamped,
         })
     }
