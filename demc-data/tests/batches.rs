@@ -288,24 +288,22 @@ fn axes_are_told_in_other_ways_the_same_for_normals_and_positions() {
     let (mut ways, mut mirrored) = (HashSet::new(), HashSet::new());
     for (before, after) in before.chunks(FEATURES).zip(after.chunks(FEATURES)) {
         assert_eq!(before[6..], after[6..], "textures");
-        let way_of = |first: usize| -> Vec<(usize, bool)> {
-            let axis = |plane: &Vec<f32>| {
-                let matches = |sign: f32, from: &Vec<f32>| {
-                    from.iter().zip(plane).all(|(a, b)| a * sign == *b)
-                };
-                let found = (0..3).find_map(|from| {
-                    let of = &before[first + from];
-                    [false, true]
-                        .into_iter()
-                        .find(|turned| matches(if *turned { -1.0 } else { 1.0 }, of))
-                        .map(|turned| (from, turned))
-                });
-                found.expect("it is one of the axes")
-            };
-            after[first..first + 3].iter().map(axis).collect()
+        // Positions tell the way: where a patch shows one wall, two axes of its normal are alike.
+        let sign = |turned| if turned { -1.0 } else { 1.0 };
+        let is = |plane: &[f32], of: &[f32], turned: bool| {
+            of.iter().zip(plane).all(|(a, b)| a * sign(turned) == *b)
         };
-        let way = way_of(3);
-        assert_eq!(way_of(0), way, "normals as positions");
+        let way: Vec<(usize, bool)> = (3..6)
+            .map(|plane| {
+                let all = (0..3).flat_map(|from| [(from, false), (from, true)]);
+                let mut all =
+                    all.filter(|(from, turned)| is(&after[plane], &before[3 + from], *turned));
+                all.next().expect("it is one of the axes")
+            })
+            .collect();
+        for (normal, (from, turned)) in way.iter().enumerate() {
+            assert!(is(&after[normal], &before[*from], *turned), "{way:?}");
+        }
         mirrored.extend(way.iter().map(|(_, turned)| *turned));
         ways.insert(way);
     }
