@@ -19,7 +19,7 @@ def color(rng: Rng) -> list[float]:
 
 
 def sky(rng: Rng, brightness: float, skyline: bool = False) -> dict:
-    """An environment map: a gradient with clouds, a sun of one or a few degrees in three of four, and buildings or trees before it."""
+    """An environment map: a gradient with clouds, a sun of one or a few degrees in three of four, and with a `skyline` buildings before it."""
     height, width = 256, 512
     up = np.linspace(1, -1, height)[:, None, None]
     zenith = np.array([rng.uniform(0.5, 1), rng.uniform(0.7, 1), 1.0]) * rng.uniform(0.4, 1)
@@ -43,9 +43,8 @@ def sky(rng: Rng, brightness: float, skyline: bool = False) -> dict:
 
 
 def built(rng: Rng, image: np.ndarray) -> np.ndarray:
-    """Blocks with windows along the horizon of an environment map, `[height, width, 3]`, and something coarse for the ground."""
+    """The environment map `[height, width, 3]` with blocks with windows along its horizon, and something coarse for the ground; changed in place."""
     height, width, _ = image.shape
-    image = image.copy()
     horizon, left = height // 2, 0
     bumps = noise(rng, height, width, 6)[..., None]
     while left < width:

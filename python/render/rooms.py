@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from furniture import Furnished
 from patterns import Rng, mosaic, sky
+from stage import square_film
 from variant import mi
 
 
@@ -187,5 +188,5 @@ class Room(Furnished):
             "type": "perspective",
             "fov": float(rng.uniform(30, 60) if close else rng.uniform(50, 85)),
             "to_world": mi.ScalarTransform4f().look_at(eye.tolist(), target.tolist(), [0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": side, "height": side, "rfilter": {"type": "box"}},
+            "film": square_film(side),
         }

@@ -9,6 +9,17 @@ from variant import mi
 METALS = ("Al", "Ag", "Au", "Cu", "Cr", "W")
 
 
+def tiled(image: np.ndarray, times: float) -> dict:
+    """A texture that repeats so many times along either side of what it covers."""
+    transform = mi.ScalarTransform3f().scale([times, times])
+    return {"type": "bitmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "raw": True, "to_uv": transform}
+
+
+def square_film(side: int) -> dict:
+    """Of `side` x `side` pixels, each the mean of its own samples."""
+    return {"type": "hdrfilm", "width": side, "height": side, "rfilter": {"type": "box"}}
+
+
 class Stage:
     """Materials to choose from, and shapes made of them.
 
@@ -41,8 +52,7 @@ class Stage:
             scale = float(np.exp(self.rng.uniform(np.log(0.7), np.log(6))))
         if grained:
             image = np.clip(image * grain(self.grains), 0.005, 0.95)
-        transform = mi.ScalarTransform3f().scale([scale, scale])
-        return {"type": "bitmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "raw": True, "to_uv": transform}
+        return tiled(image, scale)
 
     def material(self, plain: bool = False) -> dict:
         rng = self.rng

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from furniture import Furnished
 from patterns import Rng, grain, pattern, sky
+from stage import square_film, tiled
 from variant import mi
 
 RINGS, SEGMENTS = 40, 48
@@ -34,8 +35,7 @@ class Still(Furnished):
         if rng.random() < 0.75:
             image = np.clip(image * grain(rng), 0.005, 0.95)
         tile = self.reach * np.exp(rng.uniform(np.log(0.4), np.log(3)))
-        scale = [float(side / tile)] * 2
-        paint = {"type": "bitmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "raw": True, "to_uv": mi.ScalarTransform3f().scale(scale)}
+        paint = tiled(image, float(side / tile))
         if rng.random() < 0.6:
             return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": paint}}
         gloss = {"type": "roughplastic", "diffuse_reflectance": paint, "alpha": float(rng.uniform(0.1, 0.5)), "nonlinear": True}
@@ -139,5 +139,5 @@ class Still(Furnished):
             "fov": float(rng.uniform(25, 55)),
             "near_clip": 0.001,
             "to_world": mi.ScalarTransform4f().look_at(eye.tolist(), target.tolist(), [0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": side, "height": side, "rfilter": {"type": "box"}},
+            "film": square_film(side),
         }
