@@ -1,6 +1,7 @@
 //! Odd EXR files and small data sets for the tests.
 #![allow(dead_code, reason = "each test binary uses its own part")]
 
+pub mod batches;
 pub mod files;
 pub mod rewritten;
 
