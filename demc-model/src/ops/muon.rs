@@ -1,17 +1,28 @@
 //! Muon's step on one kernel (Jordan et al. 2024, "Muon: An optimizer for hidden layers in neural networks").
 //!
 //! The gradient's running sum, as a matrix with a row for each output, gives way to the nearest matrix with orthogonal rows: every direction in
-//! which the kernel can move is gone as far as any other, not only those few that own the gradient. The arithmetic is Burn's on every
-//! device (five Newton-Schulz iterations); momentum is kept here, because Burn's cannot be read back for a checkpoint.
+//! which the kernel can move is gone as far as any other, not only those few that own the gradient. It is Burn's `Muon`, which a test holds
+//! it against, but for two things: momentum is kept here, because Burn's cannot be read back for a checkpoint, and the iterations are on
+//! the products of rows, which are small, in place of the matrix, which is many times as wide.
 
-use burn::optim::momentum::MomentumConfig;
-use burn::optim::{AdjustLrFn, MuonConfig, Optimizer};
 use burn::tensor::Tensor;
 
 use crate::weights::{fan_in, is_deconvolution, outputs};
 
 /// What a step keeps of the sum of gradients (Jordan et al.'s).
 const MOMENTUM: f64 = 0.95;
+
+/// Newton-Schulz iterations (Jordan et al.'s).
+const ITERATIONS: usize = 5;
+
+/// The coefficients `a`, `b` and `c` of one (Jordan et al.'s).
+const COEFFICIENTS: [f64; 3] = [3.4445, -4.775, 2.0315];
+
+/// Least norm that a matrix is divided by (Burn's).
+const LEAST_NORM: f64 = 1e-7;
+
+/// Root mean square of a step at a rate of one (Liu et al. 2025, Eq. 4).
+const ROOT_MEAN_SQUARE: f64 = 0.2;
 
 /// The kernel `name` after a step, with the sum of its gradients so far, flattened; `None` before the first step.
 ///
@@ -40,17 +51,38 @@ pub fn step<const D: usize>(
     let ahead = velocity.clone().mul_scalar(MOMENTUM) + grad;
     let layout = Layout::of(name, &shape);
     let share = fan_in(name, &shape) as f64 / layout.columns as f64;
-    let rule = MuonConfig::new()
-        .with_momentum(MomentumConfig {
-            momentum: 0.0,
-            dampening: 0.0,
-            nesterov: false,
-        })
-        .with_adjust_lr_fn(AdjustLrFn::MatchRmsAdamW)
-        .build();
-    let (matrix, ahead) = (layout.matrix(kernel.reshape([-1])), layout.matrix(ahead));
-    let (stepped, _) = rule.step::<2>(lr * share.sqrt(), matrix, ahead, None);
-    (layout.values(stepped).reshape(shape), velocity)
+    let longer = layout.rows.max(layout.columns) as f64;
+    let length = lr * ROOT_MEAN_SQUARE * (longer * share).sqrt();
+    let moved = layout.values(orthogonal(layout.matrix(ahead), length));
+    (kernel - moved.reshape(shape), velocity)
+}
+
+/// The nearest matrix with orthogonal rows, or columns where they are fewer, times `length`.
+///
+/// An iteration (Jordan et al.) takes `X` to `Q X` with `Q = a + b A + c A^2` and `A = X X^T`. So `X` after all of them is a product of the
+/// `Q`s times `X`, and `A` after one is `Q A Q`: all there is to do with `X` itself, which has some ten times as many columns as rows,
+/// is `A` before the first and the product after the last.
+fn orthogonal(x: Tensor<2>, length: f64) -> Tensor<2> {
+    let [rows, columns] = x.dims();
+    if rows > columns {
+        return orthogonal(x.transpose(), length).transpose();
+    }
+    let norm = (x.clone() * x.clone()).sum().sqrt();
+    let norm = norm.clamp_min(LEAST_NORM).unsqueeze::<2>();
+    let x = x / norm;
+    let identity = Tensor::<2>::eye(rows, &x.device());
+    let [a, b, c] = COEFFICIENTS;
+    let mut gram = x.clone().matmul(x.clone().transpose());
+    let mut product = identity.clone().mul_scalar(length);
+    for iteration in 1..=ITERATIONS {
+        let square = gram.clone().matmul(gram.clone());
+        let q = identity.clone().mul_scalar(a) + gram.clone().mul_scalar(b) + square.mul_scalar(c);
+        product = q.clone().matmul(product);
+        if iteration < ITERATIONS {
+            gram = q.clone().matmul(gram).matmul(q);
+        }
+    }
+    product.matmul(x)
 }
 
 /// How the values of a kernel lie in its matrix.
@@ -99,6 +131,8 @@ impl Layout {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use burn::optim::momentum::MomentumConfig;
+    use burn::optim::{AdjustLrFn, MuonConfig, Optimizer};
     use burn::tensor::{Device, TensorData};
 
     fn tensor<const D: usize>(shape: [usize; D], values: &[f32]) -> Tensor<D> {
@@ -107,6 +141,46 @@ mod tests {
 
     fn host<const D: usize>(tensor: &Tensor<D>) -> Vec<f32> {
         tensor.to_data().try_to_vec().unwrap()
+    }
+
+    /// Wide and tall matrices, of rows that are alike but for a tenth: within a thousandth of the longest value.
+    #[test]
+    fn steps_are_those_of_burns_muon() {
+        let none = MomentumConfig {
+            momentum: 0.0,
+            dampening: 0.0,
+            nesterov: false,
+        };
+        let burns = MuonConfig::new()
+            .with_momentum(none)
+            .with_adjust_lr_fn(AdjustLrFn::MatchRmsAdamW)
+            .build();
+        for [outputs, inputs] in [[32, 32], [64, 3], [3, 32]] {
+            let shape = [outputs, inputs, 3, 3];
+            let columns = inputs * 9;
+            let values: Vec<f32> = (0..outputs * columns)
+                .map(|i| {
+                    let own = (i as f32 * 12.9898).sin() * 43758.547;
+                    ((i % columns) as f32 * 0.31).sin() + 0.1 * own.fract()
+                })
+                .collect();
+            let zero = || Tensor::zeros([outputs, columns], &Device::flex());
+            let grad = tensor([outputs, columns], &values);
+            // Of its first step, Nesterov's 1.95 gradients.
+            let (expected, _) = burns.step::<2>(1.0, zero(), grad.mul_scalar(1.95), None);
+            let (stepped, _) = step(
+                "a.conv.weight",
+                1.0,
+                zero().reshape(shape),
+                tensor(shape, &values),
+                None,
+            );
+            let expected = host(&expected);
+            let longest = expected.iter().fold(0.0f32, |m, v| m.max(v.abs()));
+            for (a, b) in host(&stepped).iter().zip(&expected) {
+                assert!((a - b).abs() < 1e-3 * longest, "{shape:?}: {a} {b}");
+            }
+        }
     }
 
     /// Rows that share no column are orthogonal already: the nearest orthogonal matrix has each divided by its own length, be it a
