@@ -50,6 +50,12 @@ class Baselines(unittest.TestCase):
         for noisy, clean in self.relmse("oidn"):
             self.assertLess(clean, 0.1 * noisy)
 
+    def test_features_help_and_a_reference_needs_none(self) -> None:
+        clean = lambda denoiser: sum(clean for _, clean in self.relmse(denoiser))
+        reference, features, color = map(clean, ["oidn-reference", "oidn", "oidn-color"])
+        self.assertLess(reference, 0.5 * features)
+        self.assertLess(features, 0.9 * color)
+
     def test_non_local_means_takes_some_of_the_error_away(self) -> None:
         for noisy, clean in self.relmse("nlm"):
             self.assertLess(clean, 0.9 * noisy)

@@ -5,7 +5,8 @@
     python python/tools/baselines.py nlm --data data/sample -o nlm/
 
 `oidn` is Intel's Open Image Denoise, given what it asks for: HDR colour, the albedo of the first hit, normals (both noisy,
-so without its `cleanAux`). `nlm` is non-local means of scikit-image on log(1 + 16 x), which knows of no features; its
+so without its `cleanAux`). `oidn-color` is the same without features, `oidn-reference` the same of the *references*: their own
+noise taken away, about as near to them as anything can get. `nlm` is non-local means of scikit-image on log(1 + 16 x), which knows of no features; its
 strength is the noise that scikit-image estimates in each image.
 
 One EXR file with R, G, B a scene, named as the scene's file. Files that are there are replaced.
@@ -25,10 +26,20 @@ LOG_SCALE = 16
 """What radiance is multiplied by before log(1 + x): noise in the dark and in the light gets about the same size."""
 
 
-def oidn(image: "Scene") -> np.ndarray:
+def oidn(image: "Scene", color: str = "") -> np.ndarray:
     import pyoidn
 
-    return pyoidn.denoise(image.rgb(""), albedo=image.rgb("albedo1."), normal=image.rgb("normal.", "XYZ"), hdr=True)
+    return pyoidn.denoise(image.rgb(color), albedo=image.rgb("albedo1."), normal=image.rgb("normal.", "XYZ"), hdr=True)
+
+
+def oidn_color(image: "Scene") -> np.ndarray:
+    import pyoidn
+
+    return pyoidn.denoise(image.rgb(""), hdr=True)
+
+
+def oidn_reference(image: "Scene") -> np.ndarray:
+    return oidn(image, color="ref.")
 
 
 def nlm(image: "Scene") -> np.ndarray:
@@ -42,7 +53,12 @@ def nlm(image: "Scene") -> np.ndarray:
     return np.expm1(clean) / LOG_SCALE
 
 
-DENOISERS: dict[str, Callable[["Scene"], np.ndarray]] = {"oidn": oidn, "nlm": nlm}
+DENOISERS: dict[str, Callable[["Scene"], np.ndarray]] = {
+    "oidn": oidn,
+    "oidn-color": oidn_color,
+    "oidn-reference": oidn_reference,
+    "nlm": nlm,
+}
 
 
 class Scene:
