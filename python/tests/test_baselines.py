@@ -54,7 +54,7 @@ class Baselines(unittest.TestCase):
         clean = lambda denoiser: sum(clean for _, clean in self.relmse(denoiser))
         reference, features, color = map(clean, ["oidn-reference", "oidn", "oidn-color"])
         self.assertLess(reference, 0.5 * features)
-        self.assertLess(features, 0.9 * color)
+        self.assertLess(features, color)
 
     def test_non_local_means_takes_some_of_the_error_away(self) -> None:
         for noisy, clean in self.relmse("nlm"):
