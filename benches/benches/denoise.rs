@@ -18,7 +18,7 @@ use demc_data::Frame;
 use demc_data::exr::ExrFile;
 use demc_data::exr::rewrite::{WriteOptions, rewrite};
 use demc_data::frame::{decode_input, read_input};
-use demc_infer::{Bundle, Tiling};
+use demc_infer::{Bundle, Ensemble, Tiling};
 
 /// That of the binaries.
 #[global_allocator]
@@ -71,7 +71,7 @@ fn tiles(bundle: &Bundle, frame: &Frame) -> anyhow::Result<()> {
         of(whole / 2, exact),
     ];
     let run = |tiling: &Tiling| {
-        let denoised = bundle.denoise_tiled(frame, tiling, |_, _| ());
+        let denoised = bundle.denoise_tiled(frame, tiling, Ensemble::One, |_, _| ());
         std::hint::black_box(denoised.expect("it fits"));
     };
     let turns = interleaved(
@@ -83,7 +83,7 @@ fn tiles(bundle: &Bundle, frame: &Frame) -> anyhow::Result<()> {
     println!("| {WIDTH}x{HEIGHT} | tiles | memory of a pass, MiB | pixels | s | times the whole |");
     println!("|---|---:|---:|---:|---:|---:|");
     for (cut, times) in cuts.iter().zip(&turns) {
-        let plan = bundle.tiles(HEIGHT, WIDTH, cut)?;
+        let plan = bundle.tiles(HEIGHT, WIDTH, cut, Ensemble::One)?;
         let (tall, wide) = plan.largest();
         let ratio = times.ratio(&turns[0]);
         println!(

@@ -35,7 +35,8 @@
 //!
 //! - [`bundle`]: a [`Bundle`] is a network together with everything that its numbers depend on: configuration, normalisation
 //!   statistics, channel layout, training step. The one writer and the one reader of its file.
-//! - [`denoise`]: a frame to its denoised image, of any size: over [`padding`] and [`tiles`], within the [`memory`] that is there.
+//! - [`denoise`]: a frame to its denoised image, of any size: over [`padding`] and [`tiles`], within the [`memory`] that is there,
+//!   and as the mean of an [`ensemble`](mod@ensemble) of looks at it where asked for.
 //! - [`guard`]: what is refused and what is warned of, when an image is not what the network was trained on.
 //! - [`onnx`] writes the network for other runtimes, [`verify`](mod@verify) compares what those make of it with what this crate does.
 //! - [`evaluate`]: scores against a reference, beside [`baseline`]s, with [`statistics`]. [`report`]: one page to look at them.
@@ -50,6 +51,7 @@ pub mod bundle;
 pub mod compute;
 pub mod denoise;
 pub mod device;
+pub mod ensemble;
 pub mod evaluate;
 pub mod guard;
 pub mod memory;
@@ -65,6 +67,7 @@ pub use baseline::{Baseline, BaselineError};
 pub use bundle::{Bundle, BundleError, BundleFile, BundleMeta, Names, Precision};
 pub use denoise::{DenoiseError, Denoised};
 pub use device::DeviceError;
+pub use ensemble::Ensemble;
 pub use evaluate::{ImageScore, Report, Score};
 pub use picture::Picture;
 pub use tiles::{Tiles, Tiling};

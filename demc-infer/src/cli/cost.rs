@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use demc_data::frame::{Presence, check_header};
-use demc_infer::{Bundle, Tiling, memory};
+use demc_infer::{Bundle, Ensemble, Tiling, memory};
 use demc_model::DOWNSAMPLING;
 use serde::Serialize;
 
@@ -118,7 +118,7 @@ fn image(
     width: usize,
     height: usize,
 ) -> Result<Image, memory::TooLarge> {
-    let tiles = bundle.tiles(height, width, tiling)?;
+    let tiles = bundle.tiles(height, width, tiling, Ensemble::One)?;
     let config = bundle.model.config();
     let (tall, wide) = tiles.largest();
     let padded = height.next_multiple_of(DOWNSAMPLING) * width.next_multiple_of(DOWNSAMPLING);

@@ -15,7 +15,7 @@ use super::inputs::{Frames, Inputs};
 use super::jobs::{Job, Jobs};
 use super::tiling::{TilingFlags, describe};
 use super::writing::Writing;
-use super::{Clamped, DeviceFlag, Model};
+use super::{Clamped, DeviceFlag, EnsembleFlag, Model};
 use crate::progress::Progress;
 
 /// Most bytes of an input's decoded blocks that are kept until its output is written (ours: 19 half channels of 1920x1080
@@ -72,6 +72,8 @@ pub struct Denoise {
         allow_hyphen_values = true
     )]
     exposure: f32,
+    #[command(flatten)]
+    ensemble: EnsembleFlag,
     #[command(flatten)]
     tiling: TilingFlags,
     #[command(flatten)]
@@ -131,7 +133,7 @@ impl Denoise {
             progress.line(format_args!("warning: {name}: {warning}"));
         }
         let tiling = self.tiling.tiling();
-        let denoised = bundle.denoise_tiled(&frame, &tiling, |done, of| {
+        let denoised = bundle.denoise_tiled(&frame, &tiling, self.ensemble.looks, |done, of| {
             if of > 1 {
                 progress.start(format_args!("{name}, tile {} of {of}", done + 1));
             }

@@ -22,7 +22,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Parser, Subcommand};
 use demc_infer::compute::ComputeFlags;
-use demc_infer::{Bundle, BundleError, BundleFile, device};
+use demc_infer::{Bundle, BundleError, BundleFile, Ensemble, device};
 
 /// Use a trained DEMC network: denoise renders, score it, move its weights out and in.
 #[derive(Parser)]
@@ -88,6 +88,15 @@ struct DeviceFlag {
     name: String,
     #[command(flatten)]
     compute: ComputeFlags,
+}
+
+/// `--ensemble`, for the commands that denoise.
+#[derive(Args)]
+struct EnsembleFlag {
+    /// Denoise an image as it is (1), and its mirror images (4), and those with rows as columns (8), and take the mean: a little
+    /// better, and as many times slower
+    #[arg(long = "ensemble", value_name = "LOOKS", default_value = "1")]
+    looks: Ensemble,
 }
 
 impl Model {

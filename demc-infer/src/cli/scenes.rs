@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use demc_data::{Dataset, Rgb, Scene};
 use demc_infer::report::Views;
-use demc_infer::{Baseline, BaselineError, ImageScore, Report, baseline};
+use demc_infer::{Baseline, BaselineError, Ensemble, ImageScore, Report, Tiling, baseline};
 
-use super::{Clamped, DeviceFlag, Model, Usage};
+use super::{Clamped, DeviceFlag, EnsembleFlag, Model, Usage};
 use crate::progress::Progress;
 
 /// Which model, which scenes, and what to compare with.
@@ -25,6 +25,8 @@ pub struct Scenes {
     /// name. Can be given several times
     #[arg(long = "baseline", value_name = "NAME=DIR")]
     baselines: Vec<Baseline>,
+    #[command(flatten)]
+    ensemble: EnsembleFlag,
     #[command(flatten)]
     device: DeviceFlag,
 }
@@ -48,12 +50,14 @@ impl From<Split> for demc_data::Split {
 impl Scenes {
     /// What computes the denoised images, for a title.
     pub fn model_name(&self) -> String {
-        self.model
-            .path
-            .as_ref()
-            .map_or(super::OWN_MODEL_NAME.into(), |path| {
-                path.display().to_string()
-            })
+        let path = self.model.path.as_ref();
+        let name = path.map_or(super::OWN_MODEL_NAME.into(), |path| {
+            path.display().to_string()
+        });
+        match self.ensemble.looks {
+            Ensemble::One => name,
+            looks => format!("{name}, mean of {} looks", looks.count()),
+        }
     }
 
     /// Scores every scene of the split in all metrics, one in memory at a time. `beside` sees its images and the number of all
@@ -86,7 +90,9 @@ impl Scenes {
                 .zip(&others)
                 .map(|(baseline, image)| (baseline.name.as_str(), image.planes.as_slice()))
                 .collect();
-            let denoised = bundle.denoise(&frame)?;
+            let tiling = Tiling::default();
+            let denoised = bundle.denoise_tiled(&frame, &tiling, self.ensemble.looks, |_, _| ())?;
+            let denoised = denoised.color_hdr;
             let residual = scene.ref_residual_relmse;
             let views = Views {
                 frame: &frame,

@@ -11,6 +11,7 @@ use demc_data::{FEATURES, Frame};
 use demc_model::config::COLOR_CHANNELS;
 
 use crate::Bundle;
+use crate::ensemble::Ensemble;
 use crate::memory;
 use crate::padding::Padding;
 use crate::tiles::{Tiles, Tiling};
@@ -40,11 +41,11 @@ impl Bundle {
     /// As [`check_statistics`](Self::check_statistics); an image of which not even a tile fits into the memory that is there; a
     /// device that fails, an output that is not finite.
     pub fn denoise(&self, frame: &Frame) -> Result<Vec<f32>, DenoiseError> {
-        self.denoise_tiled(frame, &Tiling::default(), |_, _| ())
+        self.denoise_tiled(frame, &Tiling::default(), Ensemble::One, |_, _| ())
             .map(|denoised| denoised.color_hdr)
     }
 
-    /// The same, cut as `tiling` says; `progress` hears how many of how many tiles are done.
+    /// The same, cut as `tiling` says and looked at as often as `ensemble` does; `progress` hears how many of how many tiles are done.
     ///
     /// # Errors
     /// As [`denoise`](Self::denoise).
@@ -52,12 +53,16 @@ impl Bundle {
         &self,
         frame: &Frame,
         tiling: &Tiling,
+        ensemble: Ensemble,
         progress: impl FnMut(usize, usize),
     ) -> Result<Denoised, DenoiseError> {
-        let input = Input::new(self, frame)?;
+        let input = Input {
+            ensemble,
+            ..Input::new(self, frame)?
+        };
         self.check_statistics(frame)?;
         let tiles = self
-            .tiles(frame.height, frame.width, tiling)
+            .tiles(frame.height, frame.width, tiling, ensemble)
             .map_err(|source| DenoiseError::Memory {
                 name: frame.name.clone(),
                 source,
@@ -83,6 +88,7 @@ impl Bundle {
         height: usize,
         width: usize,
         tiling: &Tiling,
+        ensemble: Ensemble,
     ) -> Result<Tiles, memory::TooLarge> {
         let padding = Padding { height, width };
         let padded = (padding.padded_height(), padding.padded_width());
@@ -90,7 +96,9 @@ impl Bundle {
             let output = (COLOR_CHANNELS * height * width * size_of::<f32>()) as u64;
             Some(self.memory_budget()?.saturating_sub(output))
         });
-        let need = |height, width| self.pass_bytes(height, width);
+        let beside = ensemble.bytes_per_pixel(COLOR_CHANNELS + FEATURES, COLOR_CHANNELS);
+        let need =
+            |height, width| self.pass_bytes(height, width) + beside * (height * width) as u64;
         Tiles::plan(padded, tiling, need, budget)
     }
 
@@ -134,6 +142,7 @@ struct Input<'a> {
     frame: &'a Frame,
     padding: Padding,
     device: Device,
+    ensemble: Ensemble,
 }
 
 /// Rows or columns of the padded image, in pixels.
@@ -151,6 +160,7 @@ impl<'a> Input<'a> {
                 width: frame.width,
             },
             device: bundle.device(),
+            ensemble: Ensemble::One,
         })
     }
 
@@ -177,7 +187,7 @@ impl<'a> Input<'a> {
         }
     }
 
-    /// One pass through the network: `[3, rows, columns]` in linear HDR, NaN where the network's output is.
+    /// One pass through the network for each look: `[3, rows, columns]` in linear HDR, NaN where the network's output is.
     fn tile(&self, rows: &Pixels, columns: &Pixels) -> Result<Vec<f32>, DenoiseError> {
         let normalizer = &self.bundle.meta.normalizer;
         let frame = self.frame;
@@ -187,7 +197,11 @@ impl<'a> Input<'a> {
         normalizer.color_gamma_from_hdr(&mut color);
         let color_gamma = self.tensor::<COLOR_CHANNELS>(color, rows, columns);
         let features_z = self.features_z(rows.clone(), columns.clone());
-        let out = self.bundle.model.forward(color_gamma, features_z);
+        let out = self
+            .ensemble
+            .mean([color_gamma, features_z], |[color, features]| {
+                self.bundle.model.forward(color, features)
+            });
         let mut out = self.read(out)?;
         // Going back to HDR would turn NaN into 0.
         let nan: Vec<usize> = (0..out.len()).filter(|i| out[*i].is_nan()).collect();

@@ -78,7 +78,7 @@ fn tiles_with_the_exact_halo_are_the_whole_image() {
                 ..Tiling::default()
             };
             let tiled = bundle
-                .denoise_tiled(&frame, &tiling, |_, _| ())
+                .denoise_tiled(&frame, &tiling, Ensemble::One, |_, _| ())
                 .expect("tiled");
             assert!(tiled.tiles.count() >= 6 && tiled.seam_error.is_none());
             for (a, b) in tiled.color_hdr.iter().zip(&whole) {
@@ -103,7 +103,7 @@ fn a_smaller_halo_is_measured_and_is_worse() {
             ..Tiling::default()
         };
         let denoised = bundle
-            .denoise_tiled(&frame, &tiling, |_, _| ())
+            .denoise_tiled(&frame, &tiling, Ensemble::One, |_, _| ())
             .expect("tiled");
         denoised.seam_error.expect("it is not exact")
     };
@@ -125,7 +125,7 @@ fn little_memory_makes_tiles_and_too_little_an_error() {
             memory: Some(memory),
             ..Tiling::default()
         };
-        bundle.denoise_tiled(&frame, &tiling, |_, _| ())
+        bundle.denoise_tiled(&frame, &tiling, Ensemble::One, |_, _| ())
     };
     let whole = within(u64::MAX).expect("no limit");
     assert_eq!(whole.tiles.count(), 1);
@@ -147,7 +147,65 @@ fn every_tile_is_announced() {
     let mut heard = Vec::new();
     let bundle = bundle(Variant::ColorOnly);
     let frame = frame(64, 40);
-    let denoised = bundle.denoise_tiled(&frame, &tiling, |done, of| heard.push((done, of)));
+    let denoised = bundle.denoise_tiled(&frame, &tiling, Ensemble::One, |done, of| {
+        heard.push((done, of))
+    });
     assert!(denoised.is_ok());
     assert_eq!(heard, [(0, 4), (1, 4), (2, 4), (3, 4)]);
+}
+
+/// With rows as columns an ensemble of eight is the same image, up to the order of sums; a single look is another one.
+#[test]
+fn an_ensemble_does_not_mind_how_an_image_is_held() {
+    let bundle = bundle(Variant::Demc);
+    let (width, height) = (64, 32);
+    let turned = |planes: &[f32], width: usize, height: usize| -> Vec<f32> {
+        let planes = planes.chunks_exact(width * height);
+        planes
+            .flat_map(|plane| {
+                (0..width * height).map(move |i| plane[i % height * width + i / height])
+            })
+            .collect()
+    };
+    let upright = frame(width, height);
+    let lying = Frame {
+        width: height,
+        height: width,
+        color: turned(&upright.color, width, height),
+        features: turned(&upright.features, width, height),
+        ..upright.clone()
+    };
+    let difference = |ensemble| {
+        let image = |frame: &Frame| {
+            let denoised = bundle.denoise_tiled(frame, &Tiling::default(), ensemble, |_, _| ());
+            denoised.expect("denoised").color_hdr
+        };
+        let expected = turned(&image(&upright), width, height);
+        let largest = expected.iter().fold(0.0f32, |most, x| most.max(*x));
+        let pairs = image(&lying).into_iter().zip(expected);
+        pairs.fold(0.0f32, |most, (a, b)| most.max((a - b).abs())) / largest
+    };
+    let (one, eight) = (difference(Ensemble::One), difference(Ensemble::Eight));
+    assert!(one > 1e-3 && eight < 1e-5, "{one}, {eight}");
+}
+
+#[test]
+fn an_ensemble_of_tiles_is_that_of_the_whole_image() {
+    let bundle = bundle(Variant::Demc);
+    let frame = frame(490, 250);
+    let image = |side| {
+        let tiling = Tiling {
+            side,
+            ..Tiling::default()
+        };
+        let denoised = bundle.denoise_tiled(&frame, &tiling, Ensemble::Eight, |_, _| ());
+        let denoised = denoised.expect("denoised");
+        (denoised.tiles.count(), denoised.color_hdr)
+    };
+    let ((one, whole), (some, tiled)) = (image(None), image(Some(128)));
+    assert!(one == 1 && some >= 8);
+    let largest = whole.iter().fold(0.0f32, |most, x| most.max(*x));
+    for (a, b) in tiled.iter().zip(&whole) {
+        assert!((a - b).abs() <= 2e-6 * largest, "{a}, {b}");
+    }
 }
