@@ -8,8 +8,10 @@ use std::str::FromStr;
 
 use burn::tensor::Tensor;
 
-/// Axis of the rows in a planar batch, and after it of the columns.
+/// Axis of the rows in a planar batch.
 const ROWS: usize = 2;
+
+/// Axis of the columns.
 const COLUMNS: usize = 3;
 
 /// How many looks at an image.
@@ -64,7 +66,7 @@ impl Ensemble {
     }
 }
 
-/// Asked for as often as there are no looks.
+/// A number of looks that there is no ensemble of.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{0:?}: there are 1, 4 and 8")]
 pub struct UnknownEnsemble(String);
