@@ -86,7 +86,7 @@ fn open(config: &DataConfig) -> anyhow::Result<PatchSource> {
     let layout = ChannelLayout::resolve(&config.layout)?;
     let dataset = Dataset::open(&config.root, &layout)?;
     let (scenes, _) = dataset.train_validation(config.validation, 1)?;
-    let statistics = Statistics::measure(&scenes, &layout, config.gamma)?;
+    let statistics = Statistics::measure(&scenes, &layout, config.gamma, config.demodulate)?;
     Ok(PatchSource::new(
         config,
         scenes,

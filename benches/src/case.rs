@@ -54,6 +54,7 @@ pub fn network(width: usize) -> Bundle {
     }
     let normalizer = Normalizer {
         gamma: 2.2,
+        demodulate: 0.0,
         features: FeatureStats {
             mean: [0.0; FEATURES],
             std: [1.0; FEATURES],
@@ -102,6 +103,7 @@ pub fn input(batch: usize, height: usize, width: usize) -> Input {
         size: batch,
         color_gamma: draw(3, 0.0, 1.5),
         features_z: draw(FEATURES, -1.7, 1.7),
+        modulation: None,
         reference_hdr: draw(3, 0.2, 2.0),
         patches: Vec::new(),
     };
@@ -183,6 +185,7 @@ pub fn read_input(path: &Path) -> anyhow::Result<Input> {
             size: shape[0],
             color_gamma: values("color_gamma")?,
             features_z: values("features_z")?,
+            modulation: None,
             reference_hdr: values("reference_hdr")?,
             patches: Vec::new(),
         },

@@ -15,10 +15,12 @@ use crate::{ChannelLayout, DataConfig, Error, Normalizer, Scene};
 pub struct Batch {
     /// B.
     pub size: usize,
-    /// Noisy colour `[B, 3, P, P]`, gamma space.
+    /// Noisy colour `[B, 3, P, P]`, gamma space, divided by the modulation.
     pub color_gamma: Vec<f32>,
     /// Features `[B, 12, P, P]`, Z-scored.
     pub features_z: Vec<f32>,
+    /// What the network's output is multiplied by, `[B, 3, P, P]`, gamma space ([`Normalizer::modulation`]).
+    pub modulation: Option<Vec<f32>>,
     /// Reference colour `[B, 3, P, P]`, linear HDR.
     pub reference_hdr: Vec<f32>,
     /// Where each patch was cut, before it was turned.
@@ -49,6 +51,7 @@ struct Place<'a> {
     color: &'a mut [f32],
     features: &'a mut [f32],
     reference: &'a mut [f32],
+    modulation: Option<&'a mut [f32]>,
 }
 
 impl PatchSource {
@@ -120,12 +123,16 @@ impl PatchSource {
             size: draws.len(),
             color_gamma: vec![0.0; draws.len() * 3 * pixels],
             features_z: vec![0.0; draws.len() * FEATURES * pixels],
+            modulation: (self.normalizer.demodulate > 0.0)
+                .then(|| vec![0.0; draws.len() * 3 * pixels]),
             reference_hdr: vec![0.0; draws.len() * 3 * pixels],
             patches: draws.iter().map(|draw| draw.patch).collect(),
         };
         let color = batch.color_gamma.chunks_exact_mut(3 * pixels);
         let features = batch.features_z.chunks_exact_mut(FEATURES * pixels);
         let reference = batch.reference_hdr.chunks_exact_mut(3 * pixels);
+        let modulation = batch.modulation.iter_mut();
+        let mut modulation = modulation.flat_map(|all| all.chunks_exact_mut(3 * pixels));
         let mut places: Vec<Place> = draws
             .into_iter()
             .zip(color.zip(features.zip(reference)))
@@ -134,6 +141,7 @@ impl PatchSource {
                 color,
                 features,
                 reference,
+                modulation: modulation.next(),
             })
             .collect();
         // Scene by scene: with a cache smaller than the data, each scene is decoded once a batch.
@@ -198,7 +206,12 @@ impl PatchSource {
                 .iter_mut()
                 .for_each(|value| *value *= variation.exposure);
         }
-        self.normalizer.color_gamma_from_hdr(place.color);
+        let modulation = self.normalizer.modulation(place.features);
+        self.normalizer
+            .color_gamma_from_hdr(place.color, modulation.as_deref());
+        if let (Some(out), Some(modulation)) = (&mut place.modulation, &modulation) {
+            out.copy_from_slice(modulation);
+        }
         self.normalizer.features_z_from_raw(place.features);
     }
 }

@@ -19,6 +19,10 @@ const STRIDE: usize = 80;
 const BORDER: Border = Border::Shift;
 /// Eq. 4.
 const GAMMA: f32 = 2.2;
+/// The paper's network sees colour as it is.
+const DEMODULATE: f32 = 0.0;
+/// Where it is not 0: less would let black textures blow colour up, more than a white texture has is a mistake.
+const DEMODULATIONS: std::ops::RangeInclusive<f32> = 1e-3..=1.0;
 /// Ours: the paper gives none; 64 fits its schedule, time and memory.
 const BATCH_SIZE: usize = 64;
 /// Ours: a tenth of the training split's base scenes.
@@ -57,6 +61,9 @@ pub struct DataConfig {
     pub border: Border,
     /// The transfer function's exponent is `1 / gamma` (Eq. 4); from 1 to 6.
     pub gamma: f32,
+    /// What is added to the first texture where colour is divided by it before the network, and its output multiplied by it
+    /// ([`crate::Normalizer::modulation`]), from 0.001 to 1; 0: colour is not divided.
+    pub demodulate: f32,
     /// Patches in a batch, at most 65536.
     pub batch_size: usize,
     /// Share of the training split's base scenes that is held out for validation, 0 to below 1.
@@ -81,6 +88,7 @@ impl Default for DataConfig {
             stride: STRIDE,
             border: BORDER,
             gamma: GAMMA,
+            demodulate: DEMODULATE,
             batch_size: BATCH_SIZE,
             validation: VALIDATION,
             augment: Augment::default(),
@@ -113,6 +121,12 @@ impl DataConfig {
             "gamma",
             &self.gamma,
             "from 1 to 6",
+        );
+        require(
+            self.demodulate == 0.0 || DEMODULATIONS.contains(&self.demodulate),
+            "demodulate",
+            &self.demodulate,
+            "0, or from 0.001 to 1",
         );
         require(
             (1..=MAX_BATCH_SIZE).contains(&self.batch_size),
@@ -168,13 +182,14 @@ mod tests {
             patch_size: 100,
             stride: 0,
             gamma: f32::NAN,
+            demodulate: 1e-9,
             batch_size: 0,
             validation: 1.0,
             workers: 0,
             ..DataConfig::default()
         };
         let problems = config.validate();
-        assert_eq!(problems.len(), 6, "{problems:?}");
+        assert_eq!(problems.len(), 7, "{problems:?}");
         assert_eq!(
             problems[0],
             "data.patch_size = 100: must be a positive multiple of 32, at most 4096"
@@ -188,11 +203,12 @@ mod tests {
             batch_size: MAX_BATCH_SIZE + more,
             cache_mib: MAX_CACHE_MIB + more,
             gamma: 6.0 + more as f32,
+            demodulate: 1.0 + more as f32,
             ..DataConfig::default()
         };
         assert_eq!(sized(0).validate(), Vec::<String>::new());
         let problems = sized(1).validate();
-        assert_eq!(problems.len(), 4, "{problems:?}");
+        assert_eq!(problems.len(), 5, "{problems:?}");
     }
 
     #[test]

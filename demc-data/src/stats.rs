@@ -3,7 +3,7 @@
 //! the same whatever the number of threads.
 
 use crate::dataset::size_mismatch;
-use crate::frame::{FEATURES, FramePlanes, Presence};
+use crate::frame::{FEATURES, FramePlanes, Presence, TEXTURES};
 use crate::parallel;
 use crate::plane::Plane;
 use crate::ranges::{Ranges, Summary};
@@ -34,18 +34,19 @@ pub struct Statistics {
 }
 
 impl Statistics {
-    /// Measures `scenes`; `gamma` is the transfer exponent of Eq. 4.
+    /// Measures `scenes`; `gamma` is the transfer exponent of Eq. 4, `demodulate` as in [`Normalizer`].
     ///
     /// # Errors
     /// The first scene's error that cannot be used, as in [`crate::read_frame`]; a reference that `layout`
     /// names must be there, and so must the mask.
-    pub fn measure(scenes: &[Scene], layout: &ChannelLayout, gamma: f32) -> Result<Self, Error> {
-        Self::measure_on(
-            parallel::available().min(MAX_THREADS),
-            scenes,
-            layout,
-            gamma,
-        )
+    pub fn measure(
+        scenes: &[Scene],
+        layout: &ChannelLayout,
+        gamma: f32,
+        demodulate: f32,
+    ) -> Result<Self, Error> {
+        let threads = parallel::available().min(MAX_THREADS);
+        Self::measure_on(threads, scenes, layout, gamma, demodulate)
     }
 
     /// As [`Self::measure`], on a given number of threads.
@@ -57,8 +58,9 @@ impl Statistics {
         scenes: &[Scene],
         layout: &ChannelLayout,
         gamma: f32,
+        demodulate: f32,
     ) -> Result<Self, Error> {
-        let of_scene = |scene| Sums::of(scene, layout);
+        let of_scene = |scene| Sums::of(scene, layout, demodulate);
         let mut total = Sums::default();
         let mut summaries = Vec::with_capacity(scenes.len());
         for sums in parallel::map(threads, scenes.iter().collect(), of_scene) {
@@ -69,6 +71,7 @@ impl Statistics {
         Ok(Self {
             normalizer: Normalizer {
                 gamma,
+                demodulate,
                 features: FeatureStats {
                     mean: total.features.map(|moments| moments.mean as f32),
                     std: total
@@ -100,7 +103,7 @@ struct Sums {
 }
 
 impl Sums {
-    fn of(scene: &Scene, layout: &ChannelLayout) -> Result<Self, Error> {
+    fn of(scene: &Scene, layout: &ChannelLayout, demodulate: f32) -> Result<Self, Error> {
         let planes =
             FramePlanes::read(&scene.path, layout, Presence::Required, Presence::Required)?;
         if let Some(error) = size_mismatch(scene, planes.width, planes.height) {
@@ -121,8 +124,18 @@ impl Sums {
         }
         let color: Vec<f32> = planes.color.iter().flat_map(Plane::to_f32).collect();
         sums.summary = Some(Summary::new(&color, &sums.features));
-        for (color, plane) in sums.color.iter_mut().zip(planes.reference.iter().flatten()) {
-            *color = FlatColor::of(&plane.to_f32());
+        let textures = &planes.features[TEXTURES..];
+        let references = planes.reference.iter().flatten();
+        for ((color, plane), texture) in sums.color.iter_mut().zip(references).zip(textures) {
+            let scale = match demodulate > 0.0 {
+                true => texture
+                    .to_f32()
+                    .iter()
+                    .map(|t| t.max(0.0) + demodulate)
+                    .collect(),
+                false => vec![1.0; pixels],
+            };
+            *color = FlatColor::of(&plane.to_f32(), &scale);
         }
         Ok(sums)
     }
@@ -190,8 +203,8 @@ impl Moments {
     }
 }
 
-/// The constant c with the least RelMSE against the samples r of a channel: the derivative of
-/// `sum (r - c)^2 / (r^2 + epsilon)` (Eq. 5) is zero at their mean weighted by `1 / (r^2 + epsilon)`.
+/// The constant c that has, times m, the least RelMSE against the samples r of a channel: the derivative of
+/// `sum (r - m c)^2 / (r^2 + epsilon)` (Eq. 5) is zero at the mean of r / m weighted by `m^2 / (r^2 + epsilon)`.
 #[derive(Debug, Default, Clone, Copy)]
 struct FlatColor {
     weighted: f64,
@@ -199,13 +212,13 @@ struct FlatColor {
 }
 
 impl FlatColor {
-    fn of(samples_hdr: &[f32]) -> Self {
+    fn of(samples_hdr: &[f32], scale: &[f32]) -> Self {
         let mut sums = Self::default();
-        for &sample in samples_hdr {
-            let sample = f64::from(sample);
-            let weight = 1.0 / (sample * sample + RELMSE_EPSILON);
+        for (&sample, &scale) in samples_hdr.iter().zip(scale) {
+            let [sample, scale] = [sample, scale].map(f64::from);
+            let weight = scale / (sample * sample + RELMSE_EPSILON);
             sums.weighted += weight * sample;
-            sums.weights += weight;
+            sums.weights += weight * scale;
         }
         sums
     }
@@ -254,15 +267,18 @@ mod tests {
         let samples: Vec<f32> = (0..500)
             .map(|i| (i as f32 * 0.7).sin().powi(4) * 2.0)
             .collect();
-        let loss = |c: f64| -> f64 {
-            let terms = samples.iter().map(|&r| {
-                let r = f64::from(r);
-                (r - c).powi(2) / (r * r + RELMSE_EPSILON)
-            });
-            terms.sum()
-        };
-        let best = FlatColor::of(&samples).best();
-        assert!(loss(best) < loss(best * 1.01) && loss(best) < loss(best * 0.99));
-        assert!(loss(best) < loss(0.0), "better than black");
+        let textures: Vec<f32> = (0..500).map(|i| 0.1 + (i % 7) as f32 / 7.0).collect();
+        for scale in [vec![1.0; 500], textures] {
+            let loss = |c: f64| -> f64 {
+                let terms = samples.iter().zip(&scale).map(|(&r, &m)| {
+                    let [r, m] = [r, m].map(f64::from);
+                    (r - m * c).powi(2) / (r * r + RELMSE_EPSILON)
+                });
+                terms.sum()
+            };
+            let best = FlatColor::of(&samples, &scale).best();
+            assert!(loss(best) < loss(best * 1.01) && loss(best) < loss(best * 0.99));
+            assert!(loss(best) < loss(0.0), "better than black");
+        }
     }
 }

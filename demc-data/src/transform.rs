@@ -1,10 +1,10 @@
-//! The network's input space and the way back, as pure functions: gamma on colour (Eq. 4), Z-score on
-//! features (Sec. 4.2). Their numbers are measured on the training scenes ([`crate::stats`]) and live with
-//! the weights.
+//! The network's input space and the way back, as pure functions: gamma on colour (Eq. 4), which may be divided by
+//! the first texture before, Z-score on features (Sec. 4.2). Their numbers are measured on the training scenes
+//! ([`crate::stats`]) or chosen, and live with the weights.
 
 use serde::{Deserialize, Serialize};
 
-use crate::frame::FEATURES;
+use crate::frame::{FEATURES, TEXTURES};
 
 /// Smallest standard deviation of a feature channel, in the channel's own unit (ours: the paper is silent).
 /// A constant channel becomes zero instead of 0/0; 1e-3 is half precision's spacing at 1, so what falls
@@ -27,21 +27,64 @@ pub struct FeatureStats {
 pub struct Normalizer {
     /// The exponent of Eq. 4 is `1 / gamma`; 2.2 in the paper.
     pub gamma: f32,
+    /// What is added to the first texture where colour is divided by it ([`Self::modulation`]); 0: colour is not divided.
+    #[serde(default, skip_serializing_if = "is_off")]
+    pub demodulate: f32,
     /// What the Z-score subtracts and divides by.
     pub features: FeatureStats,
-    /// The flat image with the least RelMSE (Eq. 5) against the training references, in gamma space: where a
+    /// The flat output with the least RelMSE (Eq. 5) against the training references, in gamma space: where a
     /// grey head starts.
     pub flat_color: [f32; 3],
 }
 
+fn is_off(demodulate: &f32) -> bool {
+    *demodulate == 0.0
+}
+
 impl Normalizer {
-    /// Compresses linear radiance in place: `max(x, 0)^(1/gamma)` (Eq. 4).
-    pub fn color_gamma_from_hdr(&self, color: &mut [f32]) {
-        gamma_from_hdr(color, self.gamma);
+    /// What the network's input colour is divided by and its output multiplied by, in gamma space:
+    /// `(max(t, 0) + demodulate)^(1/gamma)`, t the texture at the first intersection (albedo demodulation, as Bako et al.
+    /// 2017 have it for diffuse light; ours here). What is left is near the light that falls in, and a texture comes back
+    /// as it was. None where `demodulate` is 0.
+    ///
+    /// # Shapes
+    /// `features`, as rendered, is `[12, N]`; returns `[3, N]`.
+    ///
+    /// # Panics
+    /// If the length is no multiple of 12.
+    pub fn modulation(&self, features: &[f32]) -> Option<Vec<f32>> {
+        if is_off(&self.demodulate) {
+            return None;
+        }
+        assert_eq!(
+            features.len() % FEATURES,
+            0,
+            "features must be [{FEATURES}, N]"
+        );
+        let size = features.len() / FEATURES;
+        let mut texture = features[TEXTURES * size..(TEXTURES + 3) * size].to_vec();
+        for value in &mut texture {
+            *value = value.max(0.0) + self.demodulate;
+        }
+        gamma_from_hdr(&mut texture, self.gamma);
+        Some(texture)
     }
 
-    /// Expands gamma-compressed colour in place: `max(x, 0)^gamma`.
-    pub fn color_hdr_from_gamma(&self, color: &mut [f32]) {
+    /// Compresses linear radiance in place, `max(x, 0)^(1/gamma)` (Eq. 4), and divides it by the
+    /// [modulation](Self::modulation).
+    pub fn color_gamma_from_hdr(&self, color: &mut [f32], modulation: Option<&[f32]>) {
+        gamma_from_hdr(color, self.gamma);
+        for (value, by) in color.iter_mut().zip(modulation.into_iter().flatten()) {
+            *value /= by;
+        }
+    }
+
+    /// Multiplies gamma-compressed colour by the [modulation](Self::modulation) and expands it, in place:
+    /// `max(x, 0)^gamma`.
+    pub fn color_hdr_from_gamma(&self, color: &mut [f32], modulation: Option<&[f32]>) {
+        for (value, by) in color.iter_mut().zip(modulation.into_iter().flatten()) {
+            *value *= by;
+        }
         for value in color {
             *value = value.max(0.0).powf(self.gamma);
         }
@@ -105,6 +148,7 @@ mod tests {
         };
         Normalizer {
             gamma: 2.2,
+            demodulate: 0.0,
             features,
             flat_color: [0.4; 3],
         }
@@ -114,8 +158,8 @@ mod tests {
     fn gamma_comes_back_to_the_radiance() {
         let hdr = [0.0, 1e-4, 0.18, 1.0, 9.9, 65504.0];
         let mut color = hdr;
-        normalizer().color_gamma_from_hdr(&mut color);
-        normalizer().color_hdr_from_gamma(&mut color);
+        normalizer().color_gamma_from_hdr(&mut color, None);
+        normalizer().color_hdr_from_gamma(&mut color, None);
         for (back, hdr) in color.into_iter().zip(hdr) {
             // f32 has 24 bits; two powers lose a few at large exponents.
             assert!((back - hdr).abs() <= 1e-5 * hdr, "{back} is not {hdr}");
@@ -125,9 +169,41 @@ mod tests {
     #[test]
     fn gamma_matches_a_hand_computed_value_and_keeps_the_ends() {
         let mut color = [0.5, 0.0, 1.0, -3.0];
-        normalizer().color_gamma_from_hdr(&mut color);
+        normalizer().color_gamma_from_hdr(&mut color, None);
         assert!((color[0] - 0.729_740_1).abs() < 1e-6, "{}", color[0]);
         assert_eq!(color[1..], [0.0, 1.0, 0.0]);
+    }
+
+    /// A surface of texture 0.43 under light of 2 is light of 2 in a space without textures, and comes back as it was.
+    #[test]
+    fn a_texture_is_divided_away_and_comes_back() {
+        let normalizer = Normalizer {
+            demodulate: 0.07,
+            ..normalizer()
+        };
+        let mut features = vec![9.0; FEATURES * 2];
+        features[12..18].copy_from_slice(&[0.43, 0.0, 0.18, -1.0, 0.93, 0.0]);
+        let modulation = normalizer.modulation(&features).expect("it is on");
+        let light = [2.0, 0.5, 1.0, 0.3, 0.0, 4.0];
+        let divisors = [0.5, 0.07, 0.25, 0.07, 1.0, 0.07];
+        let hdr: Vec<f32> = light.iter().zip(divisors).map(|(a, b)| a * b).collect();
+        let mut color = hdr.clone();
+        normalizer.color_gamma_from_hdr(&mut color, Some(&modulation));
+        for (color, light) in color.iter().zip(light) {
+            let expected = light.powf(1.0 / 2.2);
+            assert!((color - expected).abs() < 1e-5, "{color} is not {expected}");
+        }
+        normalizer.color_hdr_from_gamma(&mut color, Some(&modulation));
+        for (back, hdr) in color.iter().zip(hdr) {
+            assert!((back - hdr).abs() <= 1e-5 * hdr, "{back} is not {hdr}");
+        }
+    }
+
+    #[test]
+    fn without_demodulation_nothing_is_divided_and_nothing_is_written() {
+        assert_eq!(normalizer().modulation(&[0.5; FEATURES]), None);
+        let json = serde_json::to_string(&normalizer()).expect("plain data");
+        assert!(!json.contains("demodulate"), "{json}");
     }
 
     #[test]
@@ -156,10 +232,14 @@ mod tests {
 
     #[test]
     fn statistics_survive_json() {
-        let json = serde_json::to_string(&normalizer()).expect("plain data");
-        assert_eq!(
-            serde_json::from_str::<Normalizer>(&json).expect("its own"),
-            normalizer()
-        );
+        for demodulate in [0.0, 0.07] {
+            let normalizer = Normalizer {
+                demodulate,
+                ..normalizer()
+            };
+            let json = serde_json::to_string(&normalizer).expect("plain data");
+            let back = serde_json::from_str::<Normalizer>(&json).expect("its own");
+            assert_eq!(back, normalizer);
+        }
     }
 }

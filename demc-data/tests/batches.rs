@@ -7,9 +7,10 @@ use std::fs;
 use std::sync::Arc;
 
 use demc_data::cache::SceneCache;
+use demc_data::frame::TEXTURES;
 use demc_data::{
-    Augment, Batch, BatchLoader, Border, DataConfig, Error, FEATURES, PatchSource, Scene,
-    read_frame,
+    Augment, Batch, BatchLoader, Border, DataConfig, Error, FEATURES, Normalizer, PatchSource,
+    Scene, read_frame,
 };
 use support::batches::{small, source, train_scenes};
 use support::{identity, layout, scene_channels, write};
@@ -119,6 +120,45 @@ fn holds_the_pixels_of_its_place(source: &PatchSource) {
             assert_eq!(batch.color_gamma[at(3, channel)], gamma);
         }
     }
+}
+
+/// Whatever else is done to a patch: what the network gets, times the modulation, is its colour.
+#[test]
+fn a_demodulated_batch_times_its_modulation_is_the_plain_one() {
+    let config = DataConfig {
+        augment: Augment {
+            flip: true,
+            transpose: true,
+            rgb: true,
+            exposure: true,
+            axes: true,
+            crop: true,
+            noise: true,
+        },
+        ..small()
+    };
+    let normalizer = Normalizer {
+        demodulate: 0.07,
+        ..identity()
+    };
+    let demodulating = PatchSource::new(&config, train_scenes(), layout(), normalizer, 7);
+    let [plain, found] = [source(&config), demodulating.expect("the sample").into()]
+        .map(|source| source.batch(1).expect("the sample is sound"));
+    assert_eq!(plain.modulation, None);
+    let modulation = found.modulation.expect("it is on");
+    assert_eq!(modulation.len(), plain.color_gamma.len());
+    let features = found.features_z.chunks_exact(FEATURES * 64 * 64);
+    let textures = features.flat_map(|patch| &patch[TEXTURES * 64 * 64..(TEXTURES + 3) * 64 * 64]);
+    let pixels = plain.color_gamma.iter().zip(&found.color_gamma);
+    for (((plain, found), by), texture) in pixels.zip(&modulation).zip(textures) {
+        assert!(
+            (found * by - plain).abs() <= 1e-5 * plain,
+            "{found} {by} {plain}"
+        );
+        assert_eq!(*by, (texture.max(0.0) + 0.07).powf(1.0 / 2.2));
+    }
+    assert_eq!(found.features_z, plain.features_z);
+    assert_eq!(found.reference_hdr, plain.reference_hdr);
 }
 
 #[test]

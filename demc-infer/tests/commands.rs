@@ -266,3 +266,18 @@ fn operations_and_instructions_that_do_not_exist_are_usage_errors() {
         assert!(outcome.stderr.contains(listed), "{}", outcome.stderr);
     }
 }
+
+/// A mean over several looks is another image, of the same frames; how many there are is not free.
+#[test]
+fn an_ensemble_is_asked_for_by_its_number_of_looks() {
+    let run = run_directory();
+    let score = |looks: &str| -> f64 {
+        let report = scores(run.path(), &["--ensemble", looks]);
+        let relmse = &report["mean"]["denoised"]["relmse"];
+        relmse.as_f64().expect("number")
+    };
+    let [one, four, eight] = ["1", "4", "8"].map(score);
+    assert!(one != four && four != eight, "{one} {four} {eight}");
+    let outcome = evaluate(run.path(), &["--ensemble", "3"]);
+    outcome.failure(2, "1, 4");
+}

@@ -12,7 +12,7 @@ fn trained() -> (Bundle, Vec<(Split, Frame)>) {
     let layout = bundle.meta.layout.clone();
     let dataset = Dataset::open(&sample(), &layout).expect("the sample");
     let training = dataset.split(Split::Train).expect("training scenes");
-    let statistics = Statistics::measure(&training, &layout, 2.2).expect("sound");
+    let statistics = Statistics::measure(&training, &layout, 2.2, 0.0).expect("sound");
     bundle.meta.normalizer = statistics.normalizer;
     bundle.meta.ranges = Some(statistics.ranges);
     let frames = dataset.scenes.iter().map(|scene| {

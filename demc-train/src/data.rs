@@ -45,7 +45,7 @@ impl Data {
         let all: Vec<Scene> = train.iter().chain(&validation).cloned().collect();
         // Also those that this seed happens to hold out: another may not.
         demc_data::patch::patches(&all, config.patch_size, config.stride, config.border)?;
-        let statistics = Statistics::measure(&train, &layout, config.gamma)
+        let statistics = Statistics::measure(&train, &layout, config.gamma, config.demodulate)
             .context("measuring the training scenes")?;
         let mut clamped = statistics.clamped;
         for scene in validation.iter().chain(&test) {

@@ -101,6 +101,7 @@ fn grey_batch(size: usize, side: usize) -> Batch {
         size,
         color_gamma: planes(3),
         features_z: planes(FEATURES),
+        modulation: None,
         reference_hdr: planes(3),
         patches: vec![patch; size],
     }

@@ -213,6 +213,10 @@ impl Trainer {
         let features_z = tensor(&batch.features_z, FEATURES);
         let ref_hdr = tensor(&batch.reference_hdr, 3);
         let out_gamma = self.model().forward(color_gamma, features_z);
+        let out_gamma = match &batch.modulation {
+            Some(modulation) => out_gamma * tensor(modulation, 3),
+            None => out_gamma,
+        };
         let TrainConfig {
             loss,
             loss_epsilon,

@@ -36,6 +36,15 @@ class Bundle:
     feature_std: Tensor  # [12]
     step: int
     meta: dict  # the whole header, for those who need more
+    demodulate: float = 0.0  # what is added to the first texture where colour is divided by it; 0: it is not divided
+
+    def modulation(self, features: Tensor) -> Tensor:
+        """[B, 12, H, W] features as rendered -> [B, 3, H, W], what the network's input colour is divided by and its output
+        multiplied by, in gamma space; ones where `demodulate` is 0."""
+        texture = features[:, 6:9]
+        if self.demodulate == 0:
+            return torch.ones_like(texture)
+        return gamma_from_hdr(texture.clamp_min(0) + self.demodulate, self.gamma)
 
     def features_z_from_raw(self, features: Tensor) -> Tensor:
         """[B, 12, H, W] features as rendered -> Z-scored."""
@@ -58,10 +67,11 @@ class Bundle:
         device = next(self.model.parameters()).device
         color, feats = (torch.from_numpy(np.float32(a)).to(device)[None] for a in (color_hdr, features))
         pad = (0, -width % SIZE_MULTIPLE, 0, -height % SIZE_MULTIPLE)
-        color_gamma = F.pad(gamma_from_hdr(color, self.gamma), pad, mode="replicate")
+        modulation = self.modulation(feats)
+        color_gamma = F.pad(gamma_from_hdr(color, self.gamma) / modulation, pad, mode="replicate")
         features_z = F.pad(self.features_z_from_raw(feats), pad, mode="replicate")
         out = self.model(color_gamma, features_z)[0, :, :height, :width]
-        return hdr_from_gamma(out, self.gamma).cpu().numpy()
+        return hdr_from_gamma(out * modulation[0], self.gamma).cpu().numpy()
 
     def to(self, device: torch.device | str) -> Bundle:
         """Moves the network and the statistics to `device`, in place."""
@@ -100,13 +110,22 @@ def load(path: str | os.PathLike) -> Bundle:
     if (found := entry("format")) != FORMAT:
         raise ValueError(f"{path}: bundle format {found}: this package reads format {FORMAT}")
     gamma, step = entry("normalizer", "gamma"), entry("step")
+    demodulate = meta["normalizer"].get("demodulate", 0.0)
     mean, std = (torch.tensor(entry("normalizer", "features", key)) for key in ("mean", "std"))
     model = Denoiser(ModelConfig(**entry("model")))
     try:
         model.load_state_dict(weights, strict=True)
     except RuntimeError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
-    return Bundle(model=model.eval(), gamma=gamma, feature_mean=mean, feature_std=std, step=step, meta=meta)
+    return Bundle(
+        model=model.eval(),
+        gamma=gamma,
+        feature_mean=mean,
+        feature_std=std,
+        step=step,
+        meta=meta,
+        demodulate=demodulate,
+    )
 
 
 def torch_name_from(name: str) -> str:

@@ -18,7 +18,8 @@ before = {name: weight.clone() for name, weight in bundle.model.state_dict().ite
 model = bundle.model.train()
 adam = torch.optim.Adam(model.parameters(), lr=1e-2)
 hdr, raw = (torch.from_numpy(image)[None] for image in (color, features))
-out = model(demc.gamma_from_hdr(hdr, bundle.gamma), bundle.features_z_from_raw(raw))
+modulation = bundle.modulation(raw)
+out = model(demc.gamma_from_hdr(hdr, bundle.gamma) / modulation, bundle.features_z_from_raw(raw)) * modulation
 demc.rel_mse(demc.hdr_from_gamma(out, bundle.gamma), torch.full_like(hdr, 0.2)).backward()
 adam.step()
 model.eval()

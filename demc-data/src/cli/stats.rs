@@ -52,7 +52,8 @@ pub fn run(root: &Path, layout_name: &str, split: Split, json: bool) -> Result<(
     let layout = ChannelLayout::resolve(layout_name)?;
     let dataset = Dataset::open(root, &layout)?;
     let config = DataConfig::default();
-    let measured = Statistics::measure(&dataset.split(split)?, &layout, config.gamma)?;
+    let scenes = dataset.split(split)?;
+    let measured = Statistics::measure(&scenes, &layout, config.gamma, config.demodulate)?;
     let splits = [Split::Train, Split::Test].into_iter().filter_map(|split| {
         let scenes = dataset.split(split).ok()?;
         Some((split, contents(&scenes, &config)))

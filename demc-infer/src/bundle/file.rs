@@ -183,6 +183,12 @@ fn statistics_problems(meta: &BundleMeta) -> Vec<String> {
             normalizer.gamma
         ));
     }
+    if !(normalizer.demodulate.is_finite() && normalizer.demodulate >= 0.0) {
+        problems.push(format!(
+            "normalizer.demodulate: {} is not 0 or above",
+            normalizer.demodulate
+        ));
+    }
     let features = &normalizer.features;
     for (channel, (mean, std)) in FEATURE_NAMES
         .iter()

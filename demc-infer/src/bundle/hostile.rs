@@ -187,6 +187,11 @@ fn entries_that_lie_are_refused() {
             "normalizer.gamma: -0 is not above 0",
         ),
         (
+            r#"\"gamma\":2.2"#,
+            r#"\"gamma\":2.2,\"demodulate\":-0.07"#,
+            "normalizer.demodulate: -0.07 is not 0 or above",
+        ),
+        (
             r#"\"normal\":[\"normal.X\""#,
             r#"\"normal\":[\"\\u001b[2J\""#,
             r#"layout: channel "\u{1b}[2J" is no name"#,

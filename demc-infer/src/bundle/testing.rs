@@ -23,6 +23,7 @@ pub(crate) fn bundle(variant: Variant) -> Bundle {
     };
     let normalizer = Normalizer {
         gamma: 2.2,
+        demodulate: 0.0,
         features,
         flat_color: [0.4, 0.3, 0.2],
     };

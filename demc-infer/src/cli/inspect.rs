@@ -93,6 +93,7 @@ impl Summary {
         let style = format!("{:?}, {:?} names", self.precision, self.names);
         writeln!(t, "weights     {}", style.to_lowercase())?;
         writeln!(t, "gamma       {}", meta.normalizer.gamma)?;
+        writeln!(t, "demodulate  {}", meta.normalizer.demodulate)?;
 
         writeln!(t, "\n| feature    |         mean | standard deviation |")?;
         writeln!(t, "| ---------- | -----------: | -----------------: |")?;

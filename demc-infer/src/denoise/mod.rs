@@ -1,4 +1,4 @@
-//! A frame to its denoised image: padding and tiles, gamma and Z-score, the network, back to linear HDR.
+//! A frame to its denoised image: padding and tiles, gamma, demodulation and Z-score, the network, back to linear HDR.
 
 mod error;
 mod seams;
@@ -96,7 +96,12 @@ impl Bundle {
             let output = (COLOR_CHANNELS * height * width * size_of::<f32>()) as u64;
             Some(self.memory_budget()?.saturating_sub(output))
         });
-        let beside = ensemble.bytes_per_pixel(COLOR_CHANNELS + FEATURES, COLOR_CHANNELS);
+        let modulation = match self.meta.normalizer.demodulate > 0.0 {
+            true => (COLOR_CHANNELS * size_of::<f32>()) as u64,
+            false => 0,
+        };
+        let beside =
+            modulation + ensemble.bytes_per_pixel(COLOR_CHANNELS + FEATURES, COLOR_CHANNELS);
         let need =
             |height, width| self.pass_bytes(height, width) + beside * (height * width) as u64;
         Tiles::plan(padded, tiling, need, budget)
@@ -194,9 +199,14 @@ impl<'a> Input<'a> {
         let mut color = self
             .padding
             .cut(&frame.color, rows.clone(), columns.clone());
-        normalizer.color_gamma_from_hdr(&mut color);
+        let mut features = self
+            .padding
+            .cut(&frame.features, rows.clone(), columns.clone());
+        let modulation = normalizer.modulation(&features);
+        normalizer.color_gamma_from_hdr(&mut color, modulation.as_deref());
+        normalizer.features_z_from_raw(&mut features);
         let color_gamma = self.tensor::<COLOR_CHANNELS>(color, rows, columns);
-        let features_z = self.features_z(rows.clone(), columns.clone());
+        let features_z = self.tensor::<FEATURES>(features, rows, columns);
         let out = self
             .ensemble
             .mean([color_gamma, features_z], |[color, features]| {
@@ -205,7 +215,7 @@ impl<'a> Input<'a> {
         let mut out = self.read(out)?;
         // Going back to HDR would turn NaN into 0.
         let nan: Vec<usize> = (0..out.len()).filter(|i| out[*i].is_nan()).collect();
-        normalizer.color_hdr_from_gamma(&mut out);
+        normalizer.color_hdr_from_gamma(&mut out, modulation.as_deref());
         nan.into_iter().for_each(|i| out[i] = f32::NAN);
         Ok(out)
     }

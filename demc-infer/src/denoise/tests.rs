@@ -44,6 +44,43 @@ fn padding_equals_an_image_padded_by_hand() {
     assert_eq!(bundle.denoise(&small).expect("small"), expected);
 }
 
+/// A demodulating network is the same network on colour that was divided by hand, in tiles and ensembles, too.
+#[test]
+fn demodulation_equals_a_division_by_hand() {
+    let plain = bundle(Variant::Demc);
+    let mut demodulating = bundle(Variant::Demc);
+    demodulating.meta.normalizer.demodulate = 0.07;
+    let frame = frame(70, 100);
+    let (texture, pixels) = (demc_data::frame::TEXTURES, 70 * 100);
+    let textures = &frame.features[texture * pixels..(texture + 3) * pixels];
+    let divisors: Vec<f32> = textures.iter().map(|t| t.max(0.0) + 0.07).collect();
+    let pairs = frame.color.iter().zip(&divisors);
+    let divided = Frame {
+        color: pairs.map(|(color, by)| color / by).collect(),
+        ..frame.clone()
+    };
+    let tiled = Tiling {
+        side: Some(64),
+        ..Tiling::default()
+    };
+    for (tiling, ensemble) in [
+        (Tiling::default(), Ensemble::One),
+        (tiled, Ensemble::One),
+        (Tiling::default(), Ensemble::Four),
+    ] {
+        let denoise = |bundle: &Bundle, frame| {
+            let denoised = bundle.denoise_tiled(frame, &tiling, ensemble, |_, _| ());
+            denoised.expect("denoised").color_hdr
+        };
+        let light = denoise(&plain, &divided);
+        let pairs = light.iter().zip(&divisors);
+        let expected: Vec<f32> = pairs.map(|(light, by)| light * by).collect();
+        let found = denoise(&demodulating, &frame);
+        assert!(difference(&found, &expected) < 1e-4);
+        assert!(difference(&found, &denoise(&plain, &frame)) > 1e-2);
+    }
+}
+
 #[test]
 fn two_runs_give_the_same_bits() {
     let (bundle, frame) = (bundle(Variant::Semc), frame(40, 40));

@@ -3,7 +3,7 @@
 use half::f16;
 use half::slice::HalfFloatSliceExt;
 
-use super::proto::{self, Attribute, FLOAT, FLOAT16, INT, INTS, Node, Tensor};
+use super::proto::{self, Attribute, FLOAT, FLOAT16, INT, INT64, INTS, Node, Tensor};
 use crate::Precision;
 use crate::bundle::tensors::f32_bytes;
 
@@ -76,6 +76,12 @@ impl Graph {
     /// Adds an f32 constant.
     pub(super) fn constant(&mut self, name: &str, shape: &[usize], values: &[f32]) -> Value {
         self.store(name, shape, FLOAT, f32_bytes(values))
+    }
+
+    /// Adds a list of integers.
+    pub(super) fn integers(&mut self, name: &str, values: &[i64]) -> Value {
+        let bytes = values.iter().flat_map(|value| value.to_le_bytes());
+        self.store(name, &[values.len()], INT64, bytes.collect())
     }
 
     /// Adds a kernel, stored as the precision says, and gives it as f32. Values must be exact in that precision.

@@ -4,8 +4,9 @@
 use burn::nn::BatchNorm;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
 use demc_data::Normalizer;
+use demc_data::frame::TEXTURES;
 use demc_model::Denoiser;
-use demc_model::config::{FEATURE_CHANNELS, Input};
+use demc_model::config::{COLOR_CHANNELS, FEATURE_CHANNELS, Input};
 use demc_model::decoder::DecoderLevel;
 use demc_model::encoder::EncoderLevel;
 use demc_model::inference::{Layer, scale_of};
@@ -18,7 +19,8 @@ use crate::Precision;
 impl Graph {
     /// From the graph's inputs to its output, both linear HDR.
     pub(super) fn denoise(&mut self, model: &Denoiser, normalizer: &Normalizer) {
-        let color_gamma = self.color_gamma(normalizer.gamma);
+        let modulation = self.modulation(normalizer);
+        let color_gamma = self.color_gamma(normalizer.gamma, modulation.as_ref());
         let features_z = self.features_z(normalizer);
         let detail = model.fusion.as_ref().map(|fusion| {
             let blocks = fusion.blocks.iter().enumerate();
@@ -55,16 +57,44 @@ impl Graph {
             x = self.ascend(&format!("decoder.levels.{k}"), &x, skips, level);
         }
         let image = self.conv("decoder.head", &x, &model.decoder.head, None);
-        let image = self.node("Relu", "output_gamma", &[&image], &[]);
+        let mut image = self.node("Relu", "output_gamma", &[&image], &[]);
+        if let Some(modulation) = &modulation {
+            image = self.node("Mul", "output_modulated", &[&image, modulation], &[]);
+        }
         let gamma = self.constant("gamma", &[], &[normalizer.gamma]);
         self.node("Pow", OUTPUT, &[&image, &gamma], &[]);
     }
 
-    /// `max(x, 0)^(1/gamma)` (Eq. 4).
-    fn color_gamma(&mut self, gamma: f32) -> Value {
+    /// `(max(t, 0) + demodulate)^(1/gamma)`, t the first texture ([`Normalizer::modulation`]).
+    fn modulation(&mut self, normalizer: &Normalizer) -> Option<Value> {
+        if normalizer.demodulate == 0.0 {
+            return None;
+        }
+        let first = TEXTURES as i64;
+        let bounds = [
+            self.integers("texture_start", &[first]),
+            self.integers("texture_end", &[first + COLOR_CHANNELS as i64]),
+            self.integers("texture_axis", &[1]),
+        ];
+        let [start, end, axis] = &bounds;
+        let raw = Value(FEATURES.into());
+        let texture = self.node("Slice", "texture", &[&raw, start, end, axis], &[]);
+        let positive = self.node("Relu", "texture_positive", &[&texture], &[]);
+        let offset = self.constant("demodulate", &[], &[normalizer.demodulate]);
+        let divisor = self.node("Add", "modulation_hdr", &[&positive, &offset], &[]);
+        let exponent = self.constant("inverse_gamma_texture", &[], &[1.0 / normalizer.gamma]);
+        Some(self.node("Pow", "modulation", &[&divisor, &exponent], &[]))
+    }
+
+    /// `max(x, 0)^(1/gamma)` (Eq. 4), divided by the modulation.
+    fn color_gamma(&mut self, gamma: f32, modulation: Option<&Value>) -> Value {
         let exponent = self.constant("inverse_gamma", &[], &[1.0 / gamma]);
         let positive = self.node("Relu", "color_positive", &[&Value(COLOR.into())], &[]);
-        self.node("Pow", "color_gamma", &[&positive, &exponent], &[])
+        let color = self.node("Pow", "color_gamma", &[&positive, &exponent], &[]);
+        match modulation {
+            Some(by) => self.node("Div", "color_demodulated", &[&color, by], &[]),
+            None => color,
+        }
     }
 
     /// `(x - mean) / std`, channel by channel.

@@ -144,6 +144,8 @@ pub struct Tensor {
 pub const FLOAT: i32 = 1;
 /// A data type: 16 bits.
 pub const FLOAT16: i32 = 10;
+/// `TensorProto.DataType`: signed, 64 bits.
+pub const INT64: i32 = 7;
 
 /// `ValueInfoProto`
 #[derive(Clone, PartialEq, Message)]

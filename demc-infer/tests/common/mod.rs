@@ -34,6 +34,7 @@ pub fn random_bundle() -> Bundle {
     };
     let normalizer = Normalizer {
         gamma: 2.2,
+        demodulate: 0.0,
         features: FeatureStats {
             mean: [0.2; 12],
             std: [0.7; 12],

@@ -12,7 +12,7 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use demc_data::DataConfig;
-use demc_model::ModelConfig;
+use demc_model::{ModelConfig, Variant};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -192,6 +192,13 @@ impl Config {
             &run.keep_every,
             "at most 1000000000",
         );
+        let sees_texture = self.model.variant != Variant::ColorOnly || self.data.demodulate == 0.0;
+        require(
+            sees_texture,
+            "data.demodulate",
+            &self.data.demodulate,
+            "0 for color-only, the control without features",
+        );
         let seed = train.seed <= i64::MAX as u64;
         require(
             seed,
@@ -314,6 +321,17 @@ mod tests {
             );
         }
         assert_eq!(problems.len(), 4);
+    }
+
+    #[test]
+    fn the_control_without_features_is_not_divided_by_one() {
+        let mut config = Config::default();
+        config.data.demodulate = 0.07;
+        assert_eq!(config.validate(), Vec::<String>::new());
+        config.model.variant = Variant::ColorOnly;
+        let problems = config.validate();
+        assert_eq!(problems.len(), 1, "{problems:?}");
+        assert!(problems[0].starts_with("data.demodulate = 0.07: must be 0 for color-only"));
     }
 
     #[test]

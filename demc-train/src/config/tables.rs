@@ -64,7 +64,8 @@ pub struct TrainConfig {
     pub recycle: u64,
     /// What happens at a loss or gradient that is not finite.
     pub on_nan: OnNan,
-    /// Weights to begin with: a run directory, a checkpoint or an exported file of the same `[model]`. Empty: drawn from `seed`.
+    /// Weights to begin with: a run directory, a checkpoint or an exported file of the same `[model]` and `data.gamma`; they get
+    /// used to another `data.demodulate`. Empty: drawn from `seed`.
     pub init: PathBuf,
     /// Seed of weights, validation scenes, shuffling and augmentation.
     pub seed: u64,

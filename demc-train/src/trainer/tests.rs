@@ -30,6 +30,7 @@ fn batch(size: usize, first: usize) -> Batch {
         size,
         color_gamma: pattern(3, 0.0),
         features_z: pattern(12, 1.0),
+        modulation: None,
         reference_hdr: pattern(3, 2.0),
         patches: (0..size as u32)
             .map(|x| Patch { scene: 0, y: 0, x })
@@ -56,6 +57,29 @@ fn the_loss_falls() {
     let first = step();
     let last = (0..20).map(|_| step()).last().unwrap();
     assert!(last < 0.7 * first, "{first} to {last}");
+}
+
+/// What modulates the output is in the loss: with L1 in gamma space, twice an output is as far from twice a reference.
+#[test]
+fn the_output_is_modulated_before_it_is_compared() {
+    let mut config = config(2, 1);
+    config.train.loss = demc_model::loss::Loss::L1;
+    let trainer = trainer(&config);
+    let plain = batch(2, 0);
+    let twice = Batch {
+        modulation: Some(vec![2.0; plain.color_gamma.len()]),
+        reference_hdr: plain
+            .reference_hdr
+            .iter()
+            .map(|r| r * 2f32.powf(2.2))
+            .collect(),
+        ..plain.clone()
+    };
+    let (plain, twice) = (trainer.mean_loss(&[plain]), trainer.mean_loss(&[twice]));
+    assert!(
+        plain > 0.0 && (twice / plain - 2.0).abs() < 1e-5,
+        "{plain} {twice}"
+    );
 }
 
 /// Without batch normalisation (DEMCnoSN as the paper has it) two halves make the whole.

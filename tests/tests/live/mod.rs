@@ -104,6 +104,11 @@ pub fn random_bundle(
     }
     let normalizer = Normalizer {
         gamma: 2.2,
+        // One reading with, one without.
+        demodulate: match reading {
+            Reading::Paper => 0.0,
+            Reading::Released => 0.07,
+        },
         features: FeatureStats {
             mean: std::array::from_fn(|channel| 0.3 * channel as f32 - 1.0),
             std: std::array::from_fn(|channel| 0.4 + 0.5 * channel as f32),
