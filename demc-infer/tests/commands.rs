@@ -279,5 +279,7 @@ fn an_ensemble_is_asked_for_by_its_number_of_looks() {
     let [one, four, eight] = ["1", "4", "8"].map(score);
     assert!(one != four && four != eight, "{one} {four} {eight}");
     let outcome = evaluate(run.path(), &["--ensemble", "3"]);
-    outcome.failure(2, "1, 4");
+    assert_eq!(outcome.code, 2, "{}", outcome.stderr);
+    let listed = "there are ensembles of 1, 4 and 8 looks";
+    assert!(outcome.stderr.contains(listed), "{}", outcome.stderr);
 }
