@@ -107,7 +107,7 @@ pub fn random_bundle(
         // One reading with, one without.
         demodulate: match reading {
             Reading::Paper => 0.0,
-            Reading::Released => 0.07,
+            Reading::Released => 1.0,
         },
         features: FeatureStats {
             mean: std::array::from_fn(|channel| 0.3 * channel as f32 - 1.0),
