@@ -232,6 +232,26 @@ mod tests {
         );
     }
 
+    /// Tests run in the folder of their crate, `base` starts at that of the workspace.
+    #[test]
+    fn the_ablation_that_comes_along_can_run() {
+        let workspace = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
+        let configs = Path::new(workspace).join("configs");
+        let text = std::fs::read_to_string(configs.join("ablation.toml")).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("ablation.toml");
+        let base = format!("base = \"{}/", configs.display());
+        assert!(text.contains("base = \"configs/"));
+        std::fs::write(&path, text.replace("base = \"configs/", &base)).unwrap();
+        let spec = Spec::load(&path, &[]).unwrap();
+        let names: Vec<_> = spec.variants.iter().map(|v| &v.name).collect();
+        assert_eq!(names, ["DEMC", "DEMCnoSN", "SEMC", "color-only"]);
+        assert_eq!(
+            spec.differences(),
+            ["color-only: data.demodulate = 0, there 0.07"]
+        );
+    }
+
     #[test]
     fn all_problems_are_named_at_once() {
         let text =

@@ -265,10 +265,8 @@ impl Config {
             .filter(|(key, value)| theirs.get(*key) != Some(*value));
         changed
             .map(|(key, value)| {
-                let there = theirs
-                    .get(key)
-                    .map_or("nothing".to_string(), ToString::to_string);
-                format!("{key} = {value}, there {there}")
+                let there = theirs.get(key).map_or("nothing".into(), source::shown);
+                format!("{key} = {}, there {there}", source::shown(value))
             })
             .collect()
     }
@@ -373,7 +371,7 @@ mod tests {
         }
     }
 
-    /// ablation.toml is a list of variants, which are tested as such.
+    /// But ablation.toml, which is a list of variants: see `ablation::spec`.
     #[test]
     fn every_configuration_that_comes_along_is_valid() {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs");

@@ -63,6 +63,14 @@ pub(super) fn leaves(config: &Config) -> BTreeMap<String, Value> {
     leaves
 }
 
+/// A value as it was written: keys of `f32` come back as `f64`, which would say 0.07000000029802322.
+pub(super) fn shown(value: &Value) -> String {
+    match value {
+        Value::Float(x) if f64::from(*x as f32) == *x => (*x as f32).to_string(),
+        other => other.to_string(),
+    }
+}
+
 /// Reports every key that is neither known nor the beginning of a known one, with its byte offset.
 fn unknown_keys(
     table: &DeTable,
