@@ -103,20 +103,26 @@ fn onnx_runtime_computes_what_this_program_does() {
 
     for (name, bundle) in &bundles {
         let mut worst = [0.0f32; 2];
+        let (mut lit, mut of) = (0, 0);
         for (case, frames) in frames.iter().enumerate() {
             let what = format!("{name}, {:?}, seed {seed}", SIZES[case]);
             let expected: Vec<f32> = frames
                 .iter()
                 .flat_map(|frame| bundle.denoise(frame).expect("denoised"))
                 .collect();
-            let lit = expected.iter().filter(|&&v| v > 1e-3).count();
-            assert!(lit > expected.len() / 2, "{what}: only {lit} are lit");
+            // Of all sizes together: a small image may be dark where the one that `scaled` looked at is not.
+            lit += expected.iter().filter(|&&v| v > 1e-3).count();
+            of += expected.len();
             let found = read_floats(&folder.join(format!("{name}.{case}.output")));
             for (worst, tolerance) in worst.iter_mut().zip([OF_LARGEST, OF_VALUE]) {
                 let share = assert_close(&what, &found, &expected, tolerance);
                 *worst = worst.max(1e-4 * share);
             }
         }
+        assert!(
+            lit > of / 2,
+            "{name}, seed {seed}: only {lit} of {of} are lit"
+        );
         let [of_largest, of_value] = worst;
         println!("{name}: {of_largest:.1e} of the largest value, {of_value:.1e} of each");
     }
