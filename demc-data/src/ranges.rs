@@ -188,7 +188,7 @@ mod tests {
     #[test]
     fn in_any_axes_each_of_them_may_be_any_other() {
         let mut ranges = Ranges::of(&[Summary::of(&frame(0.25, 3.0))]);
-        let textures = ranges.clone();
+        let before = ranges.clone();
         let range = |low, high| Range { low, high };
         ranges.mean[3..6].copy_from_slice(&[range(-7.0, 1.0), range(2.0, 3.0), range(0.0, 5.0)]);
         ranges.std[3..6].copy_from_slice(&[range(1.0, 2.0), range(0.5, 0.7), range(3.0, 4.0)]);
@@ -196,9 +196,9 @@ mod tests {
         assert_eq!(any.mean[3..6], [range(-7.0, 7.0); 3]);
         assert_eq!(any.std[3..6], [range(0.5, 4.0); 3]);
         assert_eq!(any.mean[0], range(-3.5, 3.5));
-        assert_eq!(any.mean[6..], textures.mean[6..]);
-        assert_eq!(any.std[6..], textures.std[6..]);
-        assert_eq!(any.exposure, textures.exposure);
+        assert_eq!(any.mean[6..], before.mean[6..]);
+        assert_eq!(any.std[6..], before.std[6..]);
+        assert_eq!(any.exposure, before.exposure);
     }
 
     #[test]

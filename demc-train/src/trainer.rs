@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use demc_data::{Batch, FEATURES, Patch};
 use demc_model::Denoiser;
 use demc_model::dormant::Renewal;
-use demc_model::loss::{dissimilarity, gamma_from_hdr};
+use demc_model::loss::{Loss, dissimilarity, gamma_from_hdr};
 use rand::Rng;
 
 use crate::census::Census;
@@ -221,16 +221,28 @@ impl Trainer {
             loss,
             loss_epsilon,
             ssim,
+            smape,
             ..
         } = self.config;
-        let ops = self.model().ops();
-        if ssim == 0.0 {
-            return loss.per_image(ops, out_gamma, ref_hdr, self.gamma, loss_epsilon);
+        let of = |loss: Loss| {
+            let (out_gamma, ref_hdr) = (out_gamma.clone(), ref_hdr.clone());
+            loss.per_image(
+                self.model().ops(),
+                out_gamma,
+                ref_hdr,
+                self.gamma,
+                loss_epsilon,
+            )
+        };
+        let mut losses = of(loss);
+        if smape > 0.0 {
+            losses = losses + of(Loss::Smape).mul_scalar(smape);
         }
-        let ref_gamma = gamma_from_hdr(ref_hdr.clone(), self.gamma);
-        let unlike = dissimilarity(out_gamma.clone(), ref_gamma);
-        let relative = loss.per_image(ops, out_gamma, ref_hdr, self.gamma, loss_epsilon);
-        relative + unlike.mul_scalar(ssim)
+        if ssim > 0.0 {
+            let ref_gamma = gamma_from_hdr(ref_hdr.clone(), self.gamma);
+            losses = losses + dissimilarity(out_gamma.clone(), ref_gamma).mul_scalar(ssim);
+        }
+        losses
     }
 }
 

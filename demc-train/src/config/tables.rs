@@ -53,6 +53,9 @@ pub struct TrainConfig {
     pub loss_epsilon: f32,
     /// How many times `(1 - SSIM) / 2` is added to the loss ([`demc_model::loss::dissimilarity`]); 0: not at all, as in the paper.
     pub ssim: f32,
+    /// How many times SMAPE ([`demc_model::loss::Loss::Smape`]) is added to the loss; 0: not at all, as in the paper. RelMSE does
+    /// not mind a colour that is a little off, or dark, where an image is clean.
+    pub smape: f32,
     /// Batches whose gradients are averaged in one step: a step sees `data.batch_size * grad_accumulation` patches.
     pub grad_accumulation: usize,
     /// Largest norm of the whole gradient; a longer one is shortened to it. 0: no limit, as in the paper.
@@ -86,6 +89,7 @@ impl Default for TrainConfig {
             loss: Loss::default(),
             loss_epsilon: demc_model::metrics::LOSS_EPSILON,
             ssim: 0.0,
+            smape: 0.0,
             grad_accumulation: 1,
             grad_clip: 0.0,
             ema: 0.0,

@@ -136,19 +136,27 @@ fn a_step_on_kernels_leaves_weights_in_their_place() {
     }
 }
 
-/// By no more than the weight: a dissimilarity is at most 1.
+/// By no more than the weight: a dissimilarity is at most 1, and so is SMAPE. Both together add what each adds.
 #[test]
-fn the_structural_term_adds_to_the_loss_and_moves_the_weights() {
-    let mut weighed = config(2, 1);
-    weighed.train.ssim = 3.0;
-    let (mut plain, mut structural) = (trainer(&config(2, 1)), trainer(&weighed));
-    let loss = |trainer: &mut Trainer| {
+fn terms_beside_the_loss_add_to_it_and_move_the_weights() {
+    let step = |ssim: f32, smape: f32| {
+        let mut config = config(2, 1);
+        (config.train.ssim, config.train.smape) = (ssim, smape);
+        let mut trainer = trainer(&config);
         let Ok(step) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
-        step.loss
+        (step.loss, trainer.model().weights())
     };
-    let added = loss(&mut structural) - loss(&mut plain);
-    assert!(added > 0.01 && added < 3.0, "{added}");
-    assert!(structural.model().weights() != plain.model().weights());
+    let (plain, weights) = step(0.0, 0.0);
+    let mut sum = 0.0;
+    for (ssim, smape) in [(3.0, 0.0), (0.0, 3.0)] {
+        let (loss, moved) = step(ssim, smape);
+        let added = loss - plain;
+        assert!(added > 0.01 && added < 3.0, "{ssim} {smape}: {added}");
+        assert!(moved != weights, "{ssim} {smape}");
+        sum += added;
+    }
+    let both = step(3.0, 3.0).0 - plain;
+    assert!((both / sum - 1.0).abs() < 1e-5, "{both} {sum}");
 }
 
 #[test]
