@@ -6,7 +6,7 @@ use anyhow::{Context, ensure};
 use burn::tensor::Device;
 use demc_data::{Batch, ChannelLayout, FEATURES, FeatureStats, Normalizer};
 use demc_infer::{Bundle, BundleMeta, Names, Precision};
-use demc_model::{Detail, Head, ModelConfig, Reading, Variant, Weight, Weights};
+use demc_model::{ModelConfig, Reading, Variant, Weight, Weights};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -34,8 +34,7 @@ pub fn network(width: usize) -> Bundle {
         variant: Variant::Demc,
         reading: Reading::Paper,
         width,
-        head: Head::Grey,
-        detail: Detail::default(),
+        ..ModelConfig::default()
     };
     let mut rng = ChaCha8Rng::seed_from_u64(SEED);
     let mut weights = config.init(&mut rng, [0.5; 3], &Device::flex()).weights();

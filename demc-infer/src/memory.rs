@@ -29,7 +29,7 @@ pub struct TooLarge {
     pub available: u64,
 }
 
-/// Values that Burn's own operations hold at a time, for each pixel and channel of the first level; 7 to 8 were measured
+/// Values that Burn's own operations hold at a time, for each pixel and channel of the first level or the fusion sub-network; 7 to 8 were measured
 /// (`--ops burn` on `flex`, width 16, 256x256 to 1280x720).
 const STOCK_VALUES: u64 = 10;
 
@@ -41,7 +41,8 @@ pub fn pass_bytes(ops: Ops, config: &ModelConfig, height: usize, width: usize) -
     match ops {
         Ops::Kernels => peak_bytes(config, height, width),
         Ops::Burn => {
-            let values = STOCK_VALUES * config.width as u64 * (height * width) as u64;
+            let widest = config.width.max(config.level_channels()[0]);
+            let values = STOCK_VALUES * widest as u64 * (height * width) as u64;
             values * size_of::<f32>() as u64
         }
     }

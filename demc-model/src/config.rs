@@ -3,6 +3,8 @@
 //! Everything that differs between two networks stands in [`VariantSpec`] or [`ReadingSpec`]; the modules read the
 //! tables and hold no branch on a name. A new variant is a new row.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 /// Levels of an encoder and of the decoder (Sec. 3.2: "five down-sampling units").
@@ -11,7 +13,7 @@ pub const LEVELS: usize = 5;
 /// Factor between the input's and the latent's height and width: 2^5.
 pub const DOWNSAMPLING: usize = 1 << LEVELS;
 
-/// Channels of a level as multiples of the base width, from the full resolution down (latent: 512 at C = 64, Sec. 3.2).
+/// The paper's channels of a level as multiples of the base width, from the full resolution down (latent: 512 at C = 64, Sec. 3.2).
 pub const LEVEL_WIDTHS: [usize; LEVELS] = [1, 2, 4, 8, 8];
 
 /// Colour channels in and out.
@@ -26,6 +28,9 @@ pub const DETAIL_CHANNELS: usize = 3;
 /// Widest base width that a configuration may ask for. Ours: 256 has 686 million parameters, 11 GB with Adam's state and
 /// gradients; more is a slip of the keyboard.
 pub const MAX_WIDTH: usize = 256;
+
+/// Most channels of a level as a multiple of the base width, for the same reason.
+pub const MAX_LEVEL: usize = 16;
 
 /// Which network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -199,8 +204,10 @@ pub struct ModelConfig {
     pub variant: Variant,
     /// Which reading of the paper.
     pub reading: Reading,
-    /// Base width C: channels at full resolution (64 in the paper).
+    /// Base width C: channels at full resolution (64 in the paper), and of the fusion sub-network.
     pub width: usize,
+    /// Channels of each level as multiples of the base width, from the full resolution down; the latent has the last level's.
+    pub levels: [usize; LEVELS],
     /// How the output convolution starts.
     pub head: Head,
     /// How the detail map starts.
@@ -214,8 +221,21 @@ impl Default for ModelConfig {
             variant: Variant::Demc,
             reading: Reading::Paper,
             width: 64,
+            levels: LEVEL_WIDTHS,
             head: Head::Grey,
             detail: Detail::Open,
+        }
+    }
+}
+
+/// What a person calls it: `demc, paper reading, width 32`, and the levels where they are not the paper's.
+impl fmt::Display for ModelConfig {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (variant, reading) = (self.variant.spec().name, self.reading.spec().name);
+        write!(f, "{variant}, {reading} reading, width {}", self.width)?;
+        match self.levels {
+            LEVEL_WIDTHS => Ok(()),
+            _ => write!(f, ", levels of {:?}", self.level_channels()),
         }
     }
 }
@@ -223,17 +243,25 @@ impl Default for ModelConfig {
 impl ModelConfig {
     /// Channels of each level, from the full resolution down.
     pub fn level_channels(&self) -> [usize; LEVELS] {
-        LEVEL_WIDTHS.map(|factor| factor * self.width)
+        self.levels.map(|factor| factor * self.width)
     }
 
     /// Every problem of the values, each as one line that begins with the key.
     pub fn validate(&self) -> Vec<String> {
-        match self.width {
-            1..=MAX_WIDTH => Vec::new(),
-            width => vec![format!(
+        let mut problems = Vec::new();
+        if !(1..=MAX_WIDTH).contains(&self.width) {
+            let width = self.width;
+            problems.push(format!(
                 "model.width = {width}: must be from 1 to {MAX_WIDTH}"
-            )],
+            ));
         }
+        if self.levels.iter().any(|of| !(1..=MAX_LEVEL).contains(of)) {
+            let levels = self.levels;
+            problems.push(format!(
+                "model.levels = {levels:?}: each must be from 1 to {MAX_LEVEL}"
+            ));
+        }
+        problems
     }
 }
 
@@ -266,5 +294,30 @@ mod tests {
             ..ModelConfig::default()
         };
         assert_eq!(config.validate().len(), 1);
+    }
+
+    #[test]
+    fn its_name_tells_levels_that_are_not_the_papers() {
+        let paper = ModelConfig::default();
+        assert_eq!(paper.to_string(), "demc, paper reading, width 64");
+        let narrow = ModelConfig {
+            width: 3,
+            levels: [1, 2, 2, 4, 1],
+            ..paper
+        };
+        let expected = "demc, paper reading, width 3, levels of [3, 6, 6, 12, 3]";
+        assert_eq!(narrow.to_string(), expected);
+    }
+
+    #[test]
+    fn a_level_without_channels_is_a_problem() {
+        for levels in [[1, 2, 0, 8, 8], [1, 2, 4, 8, 17]] {
+            let config = ModelConfig {
+                levels,
+                ..ModelConfig::default()
+            };
+            let problems = config.validate();
+            assert!(problems.len() == 1 && problems[0].starts_with("model.levels = ["));
+        }
     }
 }

@@ -109,15 +109,14 @@ fn share_of_pixels(name: &str) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Detail, Head, Reading, Variant};
+    use crate::config::{Reading, Variant};
 
     fn config(variant: Variant, reading: Reading, width: usize) -> ModelConfig {
         ModelConfig {
             variant,
             reading,
             width,
-            head: Head::Grey,
-            detail: Detail::default(),
+            ..ModelConfig::default()
         }
     }
 
@@ -167,7 +166,10 @@ mod tests {
     fn any_width_is_counted_as_if_it_was_built() {
         for variant in Variant::ALL {
             for reading in Reading::ALL {
-                let wide = config(variant, reading, 7);
+                let wide = ModelConfig {
+                    levels: [1, 3, 4, 2, 5],
+                    ..config(variant, reading, 7)
+                };
                 let named = |w: Weight| (w.name, w.shape);
                 let expected: Vec<_> = shapes(&wide).into_iter().map(named).collect();
                 assert_eq!(wide.weight_shapes(), expected);

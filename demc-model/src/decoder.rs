@@ -13,7 +13,7 @@ use crate::weights::{Builder, WeightsError};
 /// Five levels from the deepest to the full resolution, and the output convolution.
 #[derive(Module, Debug)]
 pub struct Decoder {
-    /// The levels; index 0 is the deepest, 8C channels at H/16 x W/16.
+    /// The levels; index 0 is the deepest, at H/16 x W/16.
     pub levels: Vec<DecoderLevel>,
     /// 3x3 convolution to colour; a ReLU follows.
     pub head: Conv2d,
@@ -48,7 +48,7 @@ impl Decoder {
     /// `skips` holds one list a level from the deepest up, with one entry an encoder.
     ///
     /// # Shapes
-    /// Latent `[B, 8C, H / 32, W / 32]`, skips of level k `[B, K, H / 2^(4 - k), W / 2^(4 - k)]`, to `[B, 3, H, W]`, not negative.
+    /// Latent `[B, K_5, H / 32, W / 32]`, skips of level k `[B, K, H / 2^(4 - k), W / 2^(4 - k)]`, to `[B, 3, H, W]`, not negative.
     pub fn forward(&self, latent: Maps, skips: Vec<Vec<Maps>>) -> Maps {
         let image = self
             .levels

@@ -21,7 +21,7 @@ pub struct Encoder {
 pub struct Encoded {
     /// One a level, `[B, K_i, H / 2^i, W / 2^i]` for i = 0..5, K_i the level's channels.
     pub skips: Vec<Maps>,
-    /// What lies below the last level, `[B, 8C, H / 32, W / 32]`: the latent's input, where the encoder computes it.
+    /// What lies below the last level, `[B, K_5, H / 32, W / 32]`: the latent's input, where the encoder computes it.
     pub bottom: Option<Maps>,
 }
 

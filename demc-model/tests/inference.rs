@@ -1,7 +1,7 @@
 //! Inference against the same network on Burn's operations, which knows nothing of folding, bands or larger tiles.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use demc_model::{Denoiser, Detail, Head, ModelConfig, Ops, Reading, Variant, Weights};
+use demc_model::{Denoiser, ModelConfig, Ops, Reading, Variant, Weights};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -9,14 +9,16 @@ use rand_chacha::ChaCha8Rng;
 const TOLERANCE: f32 = 2e-5;
 
 /// A network whose maps are alive and of order 1 everywhere, its running statistics far from the identity.
-fn network(variant: Variant, reading: Reading, width: usize) -> Denoiser {
-    let config = ModelConfig {
+fn config(variant: Variant, reading: Reading, width: usize) -> ModelConfig {
+    ModelConfig {
         variant,
         reading,
         width,
-        head: Head::Grey,
-        detail: Detail::default(),
-    };
+        ..ModelConfig::default()
+    }
+}
+
+fn network(config: ModelConfig) -> Denoiser {
     let mut rng = ChaCha8Rng::seed_from_u64(5);
     let mut weights = config.init(&mut rng, [0.5; 3], &Device::flex()).weights();
     for weight in &mut weights {
@@ -66,8 +68,8 @@ fn deviation(found: &[f32], expected: &[f32]) -> f32 {
     differences.fold(0.0, f32::max) / scale
 }
 
-fn check(variant: Variant, reading: Reading, width: usize, size: [usize; 3]) {
-    let model = network(variant, reading, width);
+fn check(config: ModelConfig, size: [usize; 3]) {
+    let model = network(config);
     let expected = run(&model.clone().with_ops(Ops::Burn), size);
     let alive = expected.iter().filter(|x| **x > 0.0).count();
     assert!(
@@ -76,11 +78,8 @@ fn check(variant: Variant, reading: Reading, width: usize, size: [usize; 3]) {
         expected.len()
     );
     let found = deviation(&run(&model, size), &expected);
-    println!("{variant:?} {reading:?} {width} {size:?}: {found:e}");
-    assert!(
-        found <= TOLERANCE,
-        "{variant:?} {reading:?} {width} {size:?}: {found:e}"
-    );
+    println!("{config} {size:?}: {found:e}");
+    assert!(found <= TOLERANCE, "{config} {size:?}: {found:e}");
 }
 
 #[test]
@@ -88,16 +87,19 @@ fn every_network_denoises_as_on_burns_operations() {
     for variant in Variant::ALL {
         for reading in Reading::ALL {
             for size in [[1, 32, 32], [2, 64, 96], [1, 96, 32]] {
-                check(variant, reading, 6, size);
+                check(config(variant, reading, 6), size);
             }
         }
     }
-    check(Variant::Demc, Reading::Paper, 16, [1, 64, 96]);
+    let paper = config(Variant::Demc, Reading::Paper, 16);
+    check(paper, [1, 64, 96]);
+    let levels = [3, 1, 2, 2, 4];
+    check(ModelConfig { levels, ..paper }, [1, 64, 96]);
 }
 
 #[test]
 fn the_number_of_threads_changes_no_bit() {
-    let model = network(Variant::Demc, Reading::Released, 6);
+    let model = network(config(Variant::Demc, Reading::Released, 6));
     let on = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
         pool.expect("threads").install(|| run(&model, [1, 96, 64]))

@@ -4,8 +4,9 @@
 
 use burn::tensor::{Device, Tensor};
 use demc_kernels::memory::{Recycler, used};
+use demc_model::config::LEVEL_WIDTHS as PAPERS;
 use demc_model::inference::peak_bytes;
-use demc_model::{Detail, Head, ModelConfig, Reading, Variant};
+use demc_model::{ModelConfig, Reading, Variant};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -28,19 +29,26 @@ fn check() {
     let device = Device::flex();
     // In the order of their sizes: the most so far is what can be told.
     let cases = [
-        (Variant::Demc, Reading::Paper, 24, [512, 512]),
-        (Variant::DemcNosn, Reading::Paper, 24, [1024, 512]),
-        (Variant::Demc, Reading::Released, 24, [768, 1024]),
-        (Variant::Semc, Reading::Paper, 32, [736, 1280]),
-        (Variant::Demc, Reading::Paper, 32, [1088, 1920]),
+        (Variant::Demc, Reading::Paper, 24, PAPERS, [512, 512]),
+        (Variant::DemcNosn, Reading::Paper, 24, PAPERS, [1024, 512]),
+        (Variant::Demc, Reading::Released, 24, PAPERS, [768, 1024]),
+        (Variant::Semc, Reading::Paper, 32, PAPERS, [736, 1280]),
+        (Variant::Demc, Reading::Paper, 32, PAPERS, [1088, 1920]),
+        (
+            Variant::Demc,
+            Reading::Paper,
+            32,
+            [2, 3, 4, 4, 4],
+            [1088, 1920],
+        ),
     ];
-    for (variant, reading, width, [height, columns]) in cases {
+    for (variant, reading, width, levels, [height, columns]) in cases {
         let config = ModelConfig {
             variant,
             reading,
             width,
-            head: Head::Grey,
-            detail: Detail::default(),
+            levels,
+            ..ModelConfig::default()
         };
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let model = config.init(&mut rng, [0.5; 3], &device);

@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Distribution, Tensor, TensorData};
 use demc_model::init::OPEN_BIAS;
-use demc_model::{Denoiser, Detail, Head, ModelConfig, Reading, Variant, Weights, WeightsError};
+use demc_model::{Denoiser, Detail, ModelConfig, Reading, Variant, Weights, WeightsError};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -13,8 +13,7 @@ fn config(variant: Variant, reading: Reading, width: usize) -> ModelConfig {
         variant,
         reading,
         width,
-        head: Head::Grey,
-        detail: Detail::default(),
+        ..ModelConfig::default()
     }
 }
 

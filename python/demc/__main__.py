@@ -38,7 +38,7 @@ def main() -> int:
 
     config = bundle.model.config
     parameters = sum(p.numel() for p in bundle.model.parameters())
-    network = f"{config.variant}, {config.reading} reading, width {config.width}, {parameters:,} parameters"
+    network = f"{config.variant}, {config.reading} reading, width {config.width}, levels of {config.level_channels}, {parameters:,} parameters"
     print(f"{network}, step {bundle.step}")
     return 0
 

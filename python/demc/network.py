@@ -1,6 +1,6 @@
 """DEMC, DEMCnoSN, SEMC and color-only as PyTorch modules, in both readings of the paper.
 
-Everything is NCHW. Level i = 1..5 of an encoder has ``width * (1, 2, 4, 8, 8)`` channels at 1, 1/2, 1/4, 1/8 and 1/16
+Everything is NCHW. Level i = 1..5 of an encoder has ``width * (1, 2, 4, 8, 8)`` channels, or other ``levels``, at 1, 1/2, 1/4, 1/8 and 1/16
 of the input's resolution; the latent sits at 1/32, so heights and widths must be multiples of 32. Attribute names are
 the keys of the weight files: renaming one breaks them. Section, equation and figure numbers are the paper's.
 """
@@ -19,7 +19,7 @@ FEATURES = 12
 SIZE_MULTIPLE = 32
 """Heights and widths must be multiples of this: five max-pools of 2."""
 LEVEL_FACTORS = (1, 2, 4, 8, 8)
-"""Channels of the encoder levels, in units of the base width (Fig. 3)."""
+"""The paper's channels of the levels, in units of the base width (Fig. 3)."""
 BN_EPSILON = 1e-3
 """TensorFlow's default, which the authors' code uses."""
 BN_MOMENTUM = 0.01
@@ -70,6 +70,7 @@ class ModelConfig:
     variant: str = "demc"
     reading: str = "paper"
     width: int = 64
+    levels: tuple[int, ...] = LEVEL_FACTORS
     head: str = "grey"
     detail: str = "open"
 
@@ -84,6 +85,14 @@ class ModelConfig:
                 raise ValueError(f"unknown {what} {value!r}: expected one of {', '.join(known)}")
         if self.width < 1:
             raise ValueError(f"width is {self.width}: expected at least 1")
+        object.__setattr__(self, "levels", tuple(self.levels))  # JSON has lists
+        if len(self.levels) != len(LEVEL_FACTORS) or min(self.levels) < 1:
+            raise ValueError(f"levels is {self.levels}: expected five numbers of at least 1")
+
+    @property
+    def level_channels(self) -> list[int]:
+        """Channels of each level, from the full resolution down."""
+        return [self.width * factor for factor in self.levels]
 
 
 class BatchNorm(nn.Module):
@@ -163,17 +172,17 @@ class EncoderLevel(nn.Module):
 class Encoder(nn.Module):
     """Five levels. Without `feeds_latent` (the feature encoder) there are no convolutions after the last skip."""
 
-    def __init__(self, in_channels: int, width: int, reading: Reading, feeds_latent: bool) -> None:
+    def __init__(self, in_channels: int, levels: Sequence[int], reading: Reading, feeds_latent: bool) -> None:
         super().__init__()
         self.levels = nn.ModuleList()
         for i, (convs, skip_after) in enumerate(zip(reading.convs, reading.skip_after)):
-            channels = width * LEVEL_FACTORS[i]
-            pooled = feeds_latent or i + 1 < len(LEVEL_FACTORS)
+            channels = levels[i]
+            pooled = feeds_latent or i + 1 < len(levels)
             self.levels.append(EncoderLevel(in_channels, channels, convs if pooled else skip_after, skip_after, pooled))
             in_channels = channels
 
     def forward(self, x: Tensor) -> tuple[list[Tensor], Tensor | None]:
-        """[B, C, H, W] -> the five skips, full resolution first, and the latent's input [B, 8 width, H/32, W/32]."""
+        """[B, C, H, W] -> the five skips, full resolution first, and the latent's input [B, K, H/32, W/32], K the last level's channels."""
         skips = []
         for level in self.levels:
             skip, x = level(x)
@@ -215,11 +224,11 @@ class DecoderLevel(nn.Module):
 class Decoder(nn.Module):
     """Five levels, the deepest first, and the head (conv3x3 to 3 channels, ReLU)."""
 
-    def __init__(self, width: int, encoders: int, reading: Reading) -> None:
+    def __init__(self, levels: Sequence[int], encoders: int, reading: Reading) -> None:
         super().__init__()
-        widths = [width * factor for factor in (LEVEL_FACTORS[-1], *reversed(LEVEL_FACTORS))]
+        widths = [levels[-1], *reversed(levels)]
         self.levels = nn.ModuleList(DecoderLevel(a, b, encoders, reading) for a, b in zip(widths, widths[1:]))
-        self.head = conv3x3(width, 3)
+        self.head = conv3x3(levels[0], 3)
 
     def forward(self, latent: Tensor, skips: Sequence[Sequence[Tensor]]) -> Tensor:
         """The latent and, for each encoder, its five skips (full resolution first) -> [B, 3, H, W], >= 0."""
@@ -237,15 +246,15 @@ class Denoiser(nn.Module):
         super().__init__()
         self.config = config
         self.variant = VARIANTS[config.variant]
-        reading, width = READINGS[config.reading], config.width
-        self.fusion = Fusion(width) if self.variant.fusion else None
+        reading, levels = READINGS[config.reading], config.level_channels
+        self.fusion = Fusion(config.width) if self.variant.fusion else None
         last = len(self.variant.encoders) - 1
         self.encoders = nn.ModuleList(
-            Encoder(sum(CHANNELS[name] for name in inputs), width, reading, feeds_latent=e == last)
+            Encoder(sum(CHANNELS[name] for name in inputs), levels, reading, feeds_latent=e == last)
             for e, inputs in enumerate(self.variant.encoders)
         )
-        self.latent = Latent(LEVEL_FACTORS[-1] * width, reading)
-        self.decoder = Decoder(width, last + 1, reading)
+        self.latent = Latent(levels[-1], reading)
+        self.decoder = Decoder(levels, last + 1, reading)
         self._initialise(head_bias)
 
     def forward(self, color_gamma: Tensor, features_z: Tensor) -> Tensor:

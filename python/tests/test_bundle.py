@@ -57,6 +57,27 @@ class Headers(unittest.TestCase):
                 demc.load(self.path)
             parent[keys[-1]] = value
 
+    def test_a_file_from_before_levels_has_the_papers(self) -> None:
+        del self.meta["model"]["levels"]
+        self.write()
+        self.assertEqual(demc.load(self.path).model.config.levels, (1, 2, 4, 8, 8))
+
+    def test_levels_are_those_of_the_file(self) -> None:
+        config = demc.ModelConfig(width=2, levels=(2, 3, 1, 1, 2))
+        self.weights = demc.Denoiser(config).state_dict()
+        self.meta["model"] = asdict(config)
+        self.write()
+        model = demc.load(self.path).model
+        self.assertEqual(model.config, config)
+        self.assertEqual(model.latent.conv.weight.shape, (4, 4, 3, 3))
+
+    def test_levels_are_five(self) -> None:
+        for levels in ([1, 2, 4, 8], [1, 2, 4, 8, 0]):
+            self.meta["model"]["levels"] = levels
+            self.write()
+            with self.assertRaisesRegex(ValueError, "expected five numbers of at least 1"):
+                demc.load(self.path)
+
     def test_the_command_prints_one_line(self) -> None:
         del self.meta["normalizer"]
         self.write()

@@ -2,7 +2,7 @@
 
 use burn::tensor::Device;
 use demc_data::{ChannelLayout, FEATURES, FeatureStats, Frame, Normalizer};
-use demc_model::{Detail, Head, ModelConfig, Reading, Variant};
+use demc_model::{ModelConfig, Reading, Variant};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
@@ -14,8 +14,7 @@ pub(crate) fn bundle(variant: Variant) -> Bundle {
         variant,
         reading: Reading::Released,
         width: 2,
-        head: Head::Grey,
-        detail: Detail::default(),
+        ..ModelConfig::default()
     };
     let features = FeatureStats {
         mean: std::array::from_fn(|channel| 0.1 * channel as f32),

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use demc_data::frame::{Presence, check_header};
 use demc_infer::{Bundle, Ensemble, Tiling, memory};
-use demc_model::DOWNSAMPLING;
+use demc_model::{DOWNSAMPLING, ModelConfig};
 use serde::Serialize;
 
 use super::tiling::{TilingFlags, describe};
@@ -52,9 +52,8 @@ fn size(text: &str) -> Result<(usize, usize), String> {
 
 #[derive(Serialize)]
 struct Report {
-    variant: &'static str,
-    reading: &'static str,
-    width: usize,
+    #[serde(flatten)]
+    network: ModelConfig,
     parameters: u64,
     /// Of the weights in memory.
     weight_bytes: u64,
@@ -97,9 +96,7 @@ impl Cost {
             .into_iter()
             .map(|(width, height)| image(&bundle, &tiling, width, height));
         let report = Report {
-            variant: config.variant.spec().name,
-            reading: config.reading.spec().name,
-            width: config.width,
+            network: *config,
             parameters,
             weight_bytes: parameters * size_of::<f32>() as u64,
             available_bytes: tiling.memory.or_else(|| bundle.memory_budget()),
@@ -139,10 +136,7 @@ impl Report {
     fn text(&self) -> String {
         let mib = |bytes: u64| bytes.div_ceil(1 << 20);
         let mut lines = vec![
-            format!(
-                "network     {}, {} reading, width {}",
-                self.variant, self.reading, self.width
-            ),
+            format!("network     {}", self.network),
             format!(
                 "parameters  {}, {} MiB",
                 self.parameters,

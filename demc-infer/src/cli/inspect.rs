@@ -79,15 +79,10 @@ impl Inspect {
 impl Summary {
     fn text(&self) -> Result<String, std::fmt::Error> {
         let Self { meta, .. } = self;
-        let (variant, reading) = (meta.model.variant.spec(), meta.model.reading.spec());
         let mut text = String::new();
         let t = &mut text;
         writeln!(t, "file        {}", self.file.display())?;
-        writeln!(
-            t,
-            "network     {}, {} reading, width {}",
-            variant.name, reading.name, meta.model.width
-        )?;
+        writeln!(t, "network     {}", meta.model)?;
         writeln!(t, "parameters  {}", self.parameters)?;
         writeln!(t, "step        {}", meta.step)?;
         let style = format!("{:?}, {:?} names", self.precision, self.names);

@@ -8,7 +8,7 @@ use std::process::{Command, Output};
 use burn::tensor::Device;
 use demc_data::{ChannelLayout, FeatureStats, Normalizer};
 use demc_infer::{Bundle, BundleMeta, Names, Precision};
-use demc_model::{Detail, Head, ModelConfig, Reading, Variant};
+use demc_model::{ModelConfig, Reading, Variant};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use tempfile::TempDir;
@@ -29,8 +29,7 @@ pub fn random_bundle() -> Bundle {
         variant: Variant::Demc,
         reading: Reading::Released,
         width: 2,
-        head: Head::Grey,
-        detail: Detail::default(),
+        ..ModelConfig::default()
     };
     let normalizer = Normalizer {
         gamma: 2.2,

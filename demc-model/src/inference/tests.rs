@@ -6,19 +6,25 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::{Plan, forward_with};
-use crate::{Denoiser, Detail, Head, ModelConfig, Ops, Reading, Variant};
+use crate::{Denoiser, Head, ModelConfig, Ops, Reading, Variant};
 
 /// No bands: more rows than any image here.
 const WHOLE: usize = 4096;
 
+/// Narrower and wider from level to level.
+const LEVELS: [usize; 5] = [3, 1, 2, 2, 4];
+
 fn network(variant: Variant, reading: Reading) -> Denoiser {
-    let config = ModelConfig {
+    drawn(ModelConfig {
         variant,
         reading,
         width: 6,
         head: Head::Xavier,
-        detail: Detail::default(),
-    };
+        ..ModelConfig::default()
+    })
+}
+
+fn drawn(config: ModelConfig) -> Denoiser {
     let mut rng = ChaCha8Rng::seed_from_u64(7);
     config.init(&mut rng, [0.5; 3], &Device::flex())
 }
@@ -55,9 +61,14 @@ fn every_network(check: impl Fn(&Denoiser, &str, [usize; 3])) {
     for variant in Variant::ALL {
         for reading in Reading::ALL {
             let model = network(variant, reading);
+            let levels = ModelConfig {
+                levels: LEVELS,
+                ..*model.config()
+            };
             for size in SIZES {
-                check(&model, &format!("{variant:?} {reading:?} {size:?}"), size);
+                check(&model, &format!("{} {size:?}", model.config()), size);
             }
+            check(&drawn(levels), &format!("{levels}"), SIZES[1]);
         }
     }
 }

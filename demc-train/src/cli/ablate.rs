@@ -42,9 +42,8 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     for variant in &spec.variants {
         let model = &variant.config.model;
         say(format!(
-            "{}: width {}, {} parameters, {:.0} GFLOP for a megapixel",
+            "{}: {model}, {} parameters, {:.0} GFLOP for a megapixel",
             variant.name,
-            model.width,
             model.parameter_count(),
             model.flops_per_pixel() / 1e3
         ));

@@ -11,7 +11,8 @@ use std::process::{Command, Output};
 use burn::tensor::Device;
 use demc_data::{ChannelLayout, FeatureStats, Normalizer};
 use demc_infer::{Bundle, BundleMeta};
-use demc_model::{Detail, Head, ModelConfig, Reading, Variant, Weight, Weights};
+use demc_model::config::LEVEL_WIDTHS;
+use demc_model::{ModelConfig, Reading, Variant, Weight, Weights};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
@@ -93,8 +94,12 @@ pub fn random_bundle(
         variant,
         reading,
         width: WIDTH,
-        head: Head::Grey,
-        detail: Detail::default(),
+        // The paper's or others.
+        levels: match rng.random() {
+            true => LEVEL_WIDTHS,
+            false => [2, 1, 3, 2, 4],
+        },
+        ..ModelConfig::default()
     };
     let device = Device::flex();
     let mut weights = config.init(rng, [0.5, 0.4, 0.3], &device).weights();

@@ -7,7 +7,7 @@ use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_infer::Names;
-use demc_model::{Denoiser, Detail, Head, ModelConfig, Reading, Variant, Weight, Weights};
+use demc_model::{Denoiser, ModelConfig, Reading, Variant, Weight, Weights};
 
 use crate::tensors::{self, Values};
 
@@ -78,8 +78,7 @@ pub fn network(variant: Variant, reading: Reading, fixture: &Fixture, device: &D
         variant,
         reading,
         width: WIDTH,
-        head: Head::Grey,
-        detail: Detail::default(),
+        ..ModelConfig::default()
     };
     let mut weights = Weights::new(fixture.group("weight/"));
     config
