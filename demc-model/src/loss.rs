@@ -1,17 +1,13 @@
 //! What training minimises: the distance of a network's output from the reference, and the way from gamma to HDR space.
 
-use burn::tensor::Tensor;
-use burn::tensor::module::avg_pool2d;
-use burn::tensor::ops::AvgPoolOptions;
+use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 
+use crate::metrics::{SSIM_WINDOW, gaussian};
 use crate::ops::{self, Ops};
 
 /// What keeps SMAPE finite where both images are black (the value of KPCN and its successors).
 const SMAPE_EPSILON: f32 = 0.01;
-
-/// Side of the boxes that [`dissimilarity`] compares, in pixels.
-const SSIM_BOX: usize = 8;
 
 /// Which distance.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -86,24 +82,25 @@ fn l1(out_gamma: Tensor<4>, ref_gamma: Tensor<4>) -> Tensor<1> {
     mean_of_each((out_gamma - ref_gamma).abs())
 }
 
-/// `(1 - SSIM) / 2` of each image (Wang et al. 2004) over a regular share of windows: 0 for equal images, at most 1. In gamma space up to 1, as the
-/// metric has it, but over boxes of 8x8 pixels every 4 in place of a Gaussian at every pixel, which would cost as much as a network (ours).
+/// `(1 - SSIM) / 2` of each image, SSIM as the metric [`ssim`](crate::metrics) has it (Wang et al. 2004), in gamma space up to 1: 0 for equal images, at
+/// most 1.
 ///
 /// # Shapes
-/// Two `[B, 3, H, W]` in gamma space, sides of at least 8, to `[B]`.
+/// Two `[B, 3, H, W]` in gamma space, sides of at least 11, to `[B]`.
 pub fn dissimilarity(out_gamma: Tensor<4>, ref_gamma: Tensor<4>) -> Tensor<1> {
     const STABLE_MEAN: f32 = 0.01 * 0.01;
     const STABLE_VARIANCE: f32 = 0.03 * 0.03;
-    let boxes = |image: Tensor<4>| {
-        let every = AvgPoolOptions::new([SSIM_BOX; 2]).with_stride([SSIM_BOX / 2; 2]);
-        avg_pool2d(image, every)
-    };
+    let [_, _, height, width] = out_gamma.dims();
+    let device = out_gamma.device();
+    let down = windows(height, &device).swap_dims(2, 3);
+    let across = windows(width, &device);
+    let of_windows = |image: Tensor<4>| down.clone().matmul(image.matmul(across.clone()));
     let (a, b) = (out_gamma.clamp_max(1.0), ref_gamma.clamp_max(1.0));
-    let (mean_a, mean_b) = (boxes(a.clone()), boxes(b.clone()));
+    let (mean_a, mean_b) = (of_windows(a.clone()), of_windows(b.clone()));
     let means = mean_a.clone() * mean_b.clone();
     let squares = mean_a.square() + mean_b.square();
-    let covariance = boxes(a.clone() * b.clone()) - means.clone();
-    let variances = boxes(a.square() + b.square()) - squares.clone();
+    let covariance = of_windows(a.clone() * b.clone()) - means.clone();
+    let variances = of_windows(a.square() + b.square()) - squares.clone();
     let structure = covariance.mul_scalar(2.0).add_scalar(STABLE_VARIANCE)
         / variances.add_scalar(STABLE_VARIANCE);
     let level = means.mul_scalar(2.0).add_scalar(STABLE_MEAN) / squares.add_scalar(STABLE_MEAN);
@@ -111,6 +108,22 @@ pub fn dissimilarity(out_gamma: Tensor<4>, ref_gamma: Tensor<4>) -> Tensor<1> {
         .neg()
         .add_scalar(1.0)
         .div_scalar(2.0)
+}
+
+/// What a row of `size` pixels is multiplied by for the mean over SSIM's window at each place inside: a band of weights. A product of matrices, which
+/// every device is fast at, and has the gradient of.
+///
+/// # Shapes
+/// `[1, 1, size, size - 10]`
+fn windows(size: usize, device: &Device) -> Tensor<4> {
+    let places = size + 1 - SSIM_WINDOW;
+    let mut band = vec![0.0; size * places];
+    for (k, tap) in gaussian().into_iter().enumerate() {
+        for place in 0..places {
+            band[(place + k) * places + place] = tap as f32;
+        }
+    }
+    Tensor::from_data(TensorData::new(band, [1, 1, size, places]), device)
 }
 
 /// `[B, 3, H, W]` to the mean of each image, `[B]`.
@@ -125,8 +138,7 @@ fn mean_of_each(image: Tensor<4>) -> Tensor<1> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::metrics::{LOSS_EPSILON, rel_mse_image};
-    use burn::tensor::{Device, TensorData};
+    use crate::metrics::{Image, LOSS_EPSILON, rel_mse_image, ssim};
 
     const SHAPE: [usize; 4] = [2, 3, 4, 5];
 
@@ -246,6 +258,37 @@ mod tests {
         assert!(found(board(1.0), board(1.0)).abs() < 2e-4);
         // Above 1 everything is white.
         assert!(found(of(&|_| 1.0), of(&|_| 7.0)).abs() < 2e-4);
+    }
+
+    /// Noise on a wave, with values above 1, which SSIM does not tell apart.
+    #[test]
+    fn dissimilarity_is_that_of_the_metric() {
+        let (height, width) = (24, 37);
+        let image = |phase: f32| -> Vec<f32> {
+            let values = (0..3 * height * width).map(|i| {
+                let noise = (i * 37 + (phase * 11.0) as usize) % 101;
+                0.6 + 0.5 * (i as f32 * 0.11 + phase).sin() + 0.004 * noise as f32
+            });
+            values.collect()
+        };
+        let device = Device::flex();
+        let tensor = |values: &[f32]| {
+            Tensor::<4>::from_data(
+                TensorData::new(values.to_vec(), [1, 3, height, width]),
+                &device,
+            )
+        };
+        let [a, b] = [0.0, 1.0].map(image);
+        let found = host(dissimilarity(tensor(&a), tensor(&b)))[0];
+        let hdr = |gamma: &[f32]| -> Vec<f32> { gamma.iter().map(|y| y.powf(2.2)).collect() };
+        let (a, b) = (hdr(&a), hdr(&b));
+        let [a, b] = [&a, &b].map(|hdr| Image::new(hdr, height, width).expect("finite"));
+        let expected = (1.0 - ssim(&a, &b).expect("large enough")) / 2.0;
+        assert!(expected > 0.1, "{expected}");
+        assert!(
+            (f64::from(found) - expected).abs() < 1e-5,
+            "{found}, not {expected}"
+        );
     }
 
     #[test]

@@ -14,6 +14,7 @@ mod perceptual;
 mod relative;
 
 pub use self::image::{Image, ImageError};
+pub(crate) use perceptual::gaussian;
 pub use perceptual::{SSIM_WINDOW, psnr, ssim};
 pub use relative::{
     energy_bias, mrse_pbrt, rel_mse, rel_mse_afgsa, rel_mse_image, rel_mse_map, rel_mse_sbmc,

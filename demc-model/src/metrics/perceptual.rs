@@ -105,7 +105,8 @@ fn ssim_row([mean_x, mean_y, xx, yy, xy]: &[Vec<f64>; MOMENTS]) -> f64 {
     (0..mean_x.len()).map(window).sum()
 }
 
-fn gaussian() -> [f64; SSIM_WINDOW] {
+/// The window of SSIM along one axis; it sums up to 1.
+pub(crate) fn gaussian() -> [f64; SSIM_WINDOW] {
     let centre = (SSIM_WINDOW / 2) as f64;
     let raw: [f64; SSIM_WINDOW] = std::array::from_fn(|i| {
         (-(i as f64 - centre).powi(2) / (2.0 * SSIM_SIGMA * SSIM_SIGMA)).exp()
