@@ -29,8 +29,8 @@ pub struct TooLarge {
     pub available: u64,
 }
 
-/// Values that Burn's own operations hold at a time, for each pixel and channel of the first level or the fusion sub-network; 7 to 8 were measured
-/// (`--ops burn` on `flex`, width 16, 256x256 to 1280x720).
+/// Values that Burn's own operations hold at a time, for each value of the largest map; 7 to 8 were measured (`--ops burn` on `flex`, width 16, the paper's
+/// levels, 256x256 to 1280x720).
 const STOCK_VALUES: u64 = 10;
 
 /// What a pass may take on a device that does not tell its memory, bytes (ours: half of a small graphics card).
@@ -41,9 +41,11 @@ pub fn pass_bytes(ops: Ops, config: &ModelConfig, height: usize, width: usize) -
     match ops {
         Ops::Kernels => peak_bytes(config, height, width),
         Ops::Burn => {
-            let widest = config.width.max(config.level_channels()[0]);
-            let values = STOCK_VALUES * widest as u64 * (height * width) as u64;
-            values * size_of::<f32>() as u64
+            // Of the fusion sub-network and of each level, a quarter of the pixels from one to the next.
+            let levels = config.level_channels().into_iter().enumerate();
+            let maps = levels.map(|(level, channels)| channels * (height * width) >> (2 * level));
+            let largest = maps.fold(config.width * height * width, usize::max);
+            STOCK_VALUES * largest as u64 * size_of::<f32>() as u64
         }
     }
 }

@@ -204,7 +204,7 @@ pub struct ModelConfig {
     pub variant: Variant,
     /// Which reading of the paper.
     pub reading: Reading,
-    /// Base width C: channels at full resolution (64 in the paper), and of the fusion sub-network.
+    /// Base width C (64 in the paper): channels of the fusion sub-network, and the unit of `levels`.
     pub width: usize,
     /// Channels of each level as multiples of the base width, from the full resolution down; the latent has the last level's.
     pub levels: [usize; LEVELS],

@@ -3,7 +3,7 @@
 //! ```text
 //! config.toml       the resolved configuration: `demc-train --config RUN/config.toml` repeats the run
 //! layout.toml       the channel layout, where it is not a preset
-//! run.json          versions, device, scenes of each split, statistics of the training scenes
+//! run.json          versions, device, scenes of each split, statistics of the training scenes, checksum of train.init
 //! metrics.jsonl     one object a line, see `metrics_log`
 //! tensorboard/      the same and the pictures, for TensorBoard
 //! latest, checkpoints/, best.safetensors
@@ -23,6 +23,7 @@ use serde::{Deserialize, Serialize};
 use crate::checkpoint::Store;
 use crate::config::Config;
 use crate::data::Data;
+use crate::initial::Origin;
 use crate::metrics_log::Metrics;
 
 /// The resolved configuration.
@@ -74,6 +75,9 @@ struct Record {
     normalizer: Normalizer,
     /// Which channels the planes were read from.
     layout: ChannelLayout,
+    /// The trained network that it began with, if any.
+    #[serde(default)]
+    init: Option<Origin>,
 }
 
 impl Record {
@@ -88,6 +92,7 @@ impl Record {
             scenes: Scenes::of(data),
             normalizer: data.normalizer.clone(),
             layout: data.layout.clone(),
+            init: facts.origin.cloned(),
         }
     }
 }
@@ -121,6 +126,8 @@ pub struct Facts<'a> {
     pub parameters: u64,
     /// Patches of an epoch.
     pub patches: usize,
+    /// The trained network that the run begins with, if any.
+    pub origin: Option<&'a Origin>,
 }
 
 impl RunDir {

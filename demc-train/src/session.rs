@@ -81,6 +81,7 @@ impl Session {
         let estimate = Estimate::measure(&config, &data, first, &device.clone().autodiff());
         let summary = data.summary();
         let run = Run::new(config, data, dir, checkpoint, device)?;
+        notes.extend(run.origin.as_ref().map(|origin| origin.note(run.config())));
         Ok(Session {
             run,
             estimate,

@@ -20,7 +20,7 @@ use crate::clock::Clock;
 use crate::config::{Config, OnNan};
 use crate::data::Data;
 use crate::faults::patches_of;
-use crate::initial::{Initial, initial_model};
+use crate::initial::{Initial, Origin, initial_model};
 use crate::metrics_log::Line;
 use crate::optimizer::Optimizer;
 use crate::recorder::{Recorder, timed};
@@ -41,6 +41,8 @@ pub struct Run {
     source: Arc<PatchSource>,
     trainer: Trainer,
     state: State,
+    /// The network that it begins with, where that was trained before and the run is new.
+    pub origin: Option<Origin>,
     /// Steps since one was taken.
     skipped_in_a_row: u64,
 }
@@ -79,7 +81,7 @@ impl Run {
             data.normalizer.clone(),
             config.train.seed,
         )?;
-        let (model, average, optimizer, state) = match checkpoint {
+        let (model, average, optimizer, state, origin) = match checkpoint {
             Some(Checkpoint {
                 bundle,
                 average,
@@ -100,16 +102,16 @@ impl Run {
                     "{}: the checkpoint and train.ema do not agree on whether there is an average",
                     dir.path().display()
                 );
-                (bundle.model, average, optimizer, state)
+                (bundle.model, average, optimizer, state, None)
             }
             None => {
-                let Initial { model, ranges } =
+                let Initial { model, origin } =
                     initial_model(&config, data.normalizer.flat_color, &device)?;
-                if let Some(before) = &ranges {
+                if let Some(before) = origin.as_ref().and_then(|origin| origin.ranges.as_ref()) {
                     data.ranges = data.ranges.with(before);
                 }
                 let optimizer = Optimizer::new(&config.train);
-                (model, None, optimizer, State::start())
+                (model, None, optimizer, State::start(), origin)
             }
         };
         let trainer = Trainer::new(&config, model, optimizer, average, device);
@@ -120,6 +122,7 @@ impl Run {
             source: Arc::new(source),
             trainer,
             state,
+            origin,
             skipped_in_a_row: 0,
         })
     }
@@ -154,6 +157,7 @@ impl Run {
             operations: &self.trainer.operations(),
             parameters: self.parameters(),
             patches: self.patches(),
+            origin: self.origin.as_ref(),
         };
         let note = self.dir.open(&self.config, &self.data, facts)?;
         let mut recorder =

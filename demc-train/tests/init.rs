@@ -9,6 +9,7 @@ use burn::tensor::Device;
 use common::{config, error_line, stderr, train};
 use demc_infer::Bundle;
 use demc_infer::bundle::{Names, Precision};
+use demc_train::checkpoint::sha256_of;
 
 /// The weights that a run is known by, in the order of their names, but for running statistics: those move whatever the
 /// learning rate.
@@ -51,6 +52,12 @@ fn a_run_begins_where_another_ended() {
     let output = train(&config, &second, &still);
     assert!(output.status.success(), "{}", stderr(&output));
     assert_same(&first, &second);
+    let record = fs::read(second.join("run.json")).expect("a record");
+    let record: serde_json::Value = serde_json::from_slice(&record).expect("JSON");
+    let began = Path::new(record["init"]["file"].as_str().expect("a file"));
+    let sum = sha256_of(began).expect("a file");
+    assert!(began.starts_with(&first) && record["init"]["step"] == 3);
+    assert_eq!(record["init"]["sha256"], sum.as_str());
 
     // The other seed would draw another network; and what began needs the weights no more.
     let seeded = [&still[..], &["--set", "train.seed=2"]].concat();
@@ -93,6 +100,33 @@ fn ranges_of_the_scenes_before_are_kept() {
     );
     fs::remove_file(&wide).expect("the test's own");
     assert_eq!(ranges_after(&["--resume"]), found);
+}
+
+#[test]
+fn weights_that_saw_another_colour_are_told() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    let (first, second) = (dir.path().join("first"), dir.path().join("second"));
+    let output = train(&config, &first, &["--set", "train.steps=2"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+
+    let init = format!("train.init={}", first.display());
+    let note = |demodulate: &str| {
+        let set = format!("data.demodulate={demodulate}");
+        let output = train(
+            &config,
+            &second,
+            &["--set", &init, "--set", &set, "--check"],
+        );
+        assert!(output.status.success(), "{}", stderr(&output));
+        let said = String::from_utf8_lossy(&output.stdout).into_owned();
+        let note = said
+            .lines()
+            .find(|line| line.starts_with("note: train.init"));
+        note.expect("a note").to_string()
+    };
+    assert!(note("0").ends_with("step 2"));
+    assert!(note("0.07").contains("step 2, of data.demodulate = 0: with 0.07 "));
 }
 
 #[test]

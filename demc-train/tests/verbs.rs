@@ -125,6 +125,23 @@ fn bad_ablations_exit_with_2_and_one_line() {
     assert!(error.contains("/nowhere.toml"), "{error}");
 }
 
+/// The last variant's weights are looked for before the first variant trains.
+#[test]
+fn an_ablation_knows_at_once_that_a_variant_cannot_begin() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let spec = ablation(dir.path());
+    let text_of = fs::read_to_string(&spec).expect("a file");
+    let set = "\"model.variant=color-only\"";
+    let nowhere = format!("{set}, \"train.init=/nowhere.safetensors\"");
+    fs::write(&spec, text_of.replace(set, &nowhere)).expect("a file");
+    let error = error_line(&run(&["ablate", "--config", text(&spec)]), 1);
+    assert!(
+        error.contains("color-only") && error.contains("/nowhere.safetensors"),
+        "{error}"
+    );
+    assert!(!dir.path().join("ablation").exists());
+}
+
 #[test]
 fn a_sweep_finds_a_rate_and_leaves_a_table_and_a_picture() {
     let dir = tempfile::tempdir().expect("a temporary directory");

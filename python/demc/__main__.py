@@ -36,10 +36,8 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
 
-    config = bundle.model.config
     parameters = sum(p.numel() for p in bundle.model.parameters())
-    network = f"{config.variant}, {config.reading} reading, width {config.width}, levels of {config.level_channels}, {parameters:,} parameters"
-    print(f"{network}, step {bundle.step}")
+    print(f"{bundle.model.config}, {parameters:,} parameters, step {bundle.step}")
     return 0
 
 

@@ -1,8 +1,9 @@
 """DEMC, DEMCnoSN, SEMC and color-only as PyTorch modules, in both readings of the paper.
 
-Everything is NCHW. Level i = 1..5 of an encoder has ``width * (1, 2, 4, 8, 8)`` channels, or other ``levels``, at 1, 1/2, 1/4, 1/8 and 1/16
-of the input's resolution; the latent sits at 1/32, so heights and widths must be multiples of 32. Attribute names are
-the keys of the weight files: renaming one breaks them. Section, equation and figure numbers are the paper's.
+Everything is NCHW. Level i = 1..5 of an encoder has ``width * levels[i - 1]`` channels, (1, 2, 4, 8, 8) in the paper, at
+1, 1/2, 1/4, 1/8 and 1/16 of the input's resolution; the latent sits at 1/32, so heights and widths must be multiples of
+32. Attribute names are the keys of the weight files: renaming one breaks them. Section, equation and figure numbers are
+the paper's.
 """
 
 from __future__ import annotations
@@ -65,7 +66,10 @@ READINGS = {
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The `model` part of a bundle's metadata. `head` and `detail` say only how training started: they change no computation."""
+    """The `model` part of a bundle's metadata.
+
+    `head` and `detail` say only how training started: they change no computation.
+    """
 
     variant: str = "demc"
     reading: str = "paper"
@@ -93,6 +97,11 @@ class ModelConfig:
     def level_channels(self) -> list[int]:
         """Channels of each level, from the full resolution down."""
         return [self.width * factor for factor in self.levels]
+
+    def __str__(self) -> str:
+        """What a person calls it; the levels where they are not the paper's."""
+        levels = "" if self.levels == LEVEL_FACTORS else f", levels of {self.level_channels}"
+        return f"{self.variant}, {self.reading} reading, width {self.width}{levels}"
 
 
 class BatchNorm(nn.Module):
@@ -182,7 +191,10 @@ class Encoder(nn.Module):
             in_channels = channels
 
     def forward(self, x: Tensor) -> tuple[list[Tensor], Tensor | None]:
-        """[B, C, H, W] -> the five skips, full resolution first, and the latent's input [B, K, H/32, W/32], K the last level's channels."""
+        """[B, C, H, W] -> the five skips, full resolution first, and the latent's input.
+
+        That is [B, K, H/32, W/32], K the last level's channels.
+        """
         skips = []
         for level in self.levels:
             skip, x = level(x)

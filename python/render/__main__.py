@@ -52,8 +52,9 @@ def main() -> None:
     budget = views.Budget(args.spp, args.ref_spp, args.residual)
     manifest = args.output / "manifest.json"
     left_out = json.loads(manifest.read_text()).get("left_out", {}) if manifest.exists() else {}
-    rooms = furnished_rooms(args, replace(budget, noise=NOISE, near=NEAR))
-    for base in [*own_scenes(args, budget), *rooms, *still_lifes(args, replace(budget, noise=STILL_NOISE, near=STILL_NEAR))]:
+    rooms = made(args, "room", args.rooms, furnished_room, 0, replace(budget, noise=NOISE, near=NEAR))
+    stills = made(args, "still", args.stills, still_life, 50000, replace(budget, noise=STILL_NOISE, near=STILL_NEAR))
+    for base in [*own_scenes(args, budget), *rooms, *stills]:
         missing = [name for name in base.views if not (folder / f"{name}.exr").exists() and name not in left_out]
         scene = base.load() if missing else None
         for name in missing:
@@ -79,43 +80,43 @@ def own_scenes(args, budget: views.Budget) -> Iterator[Base]:
         yield Base(path.stem, names, args.seed * 100003, budget, lambda scene=scene: scene)
 
 
-def furnished_rooms(args, budget: views.Budget) -> Iterator[Base]:
-    """Rooms by number: the same for the same seed, however many are asked for."""
-    for index in range(args.rooms):
+def made(args, kind: str, count: int, make: Callable, first_seed: int, budget: views.Budget) -> Iterator[Base]:
+    """Rooms or still lifes by number: the same for the same seed, however many are asked for."""
+    for index in range(count):
 
         def load(index: int = index) -> mi.Scene:
-            rng = np.random.default_rng([args.seed, index])
-            # Numbers of their own: the room is the same without grains, a sun or black.
-            room = Room(rng, args.grain, np.random.default_rng([args.seed, index, 2]))
-            outside = np.random.default_rng([args.seed, index, 1])
-            if outside.random() < args.sun:
-                room.sun(outside)
-            paint = np.random.default_rng([args.seed, index, 3])
-            if paint.random() < args.black:
-                room.blacken(paint)
+            subject, rng = make(args, index)
             for view in range(args.views):
-                room.scene[f"camera{view}"] = room.camera(rng, args.size)
-            return mi.load_dict(room.scene)
+                subject.scene[f"camera{view}"] = subject.camera(rng, args.size)
+            return mi.load_dict(subject.scene)
 
-        name = f"room-{args.seed}-{index}"
+        name = f"{kind}-{args.seed}-{index}"
         names = [f"{name}-{view}" for view in range(args.views)]
-        yield Base(name, names, args.seed * 100003 + index * 16, budget, load)
+        yield Base(name, names, args.seed * 100003 + first_seed + index * 16, budget, load)
 
 
-def still_lifes(args, budget: views.Budget) -> Iterator[Base]:
-    """Still lifes by number, as the rooms."""
-    for index in range(args.stills):
+def furnished_room(args, index: int) -> tuple[Room, np.random.Generator]:
+    """A room, and the numbers that go on to its cameras."""
+    rng = np.random.default_rng([args.seed, index])
+    # Numbers of their own: the room is the same without grains, a sun or black.
+    room = Room(rng, args.grain, np.random.default_rng([args.seed, index, 2]))
+    outside = np.random.default_rng([args.seed, index, 1])
+    if outside.random() < args.sun:
+        room.sun(outside)
+    paint = np.random.default_rng([args.seed, index, 3])
+    if paint.random() < args.black:
+        room.blacken(paint)
+    return room, rng
 
-        def load(index: int = index) -> mi.Scene:
-            rng = np.random.default_rng([args.seed, index, 4])
-            still = Still(rng, args.grain, np.random.default_rng([args.seed, index, 5]))
-            for view in range(args.views):
-                still.scene[f"camera{view}"] = still.camera(rng, args.size)
-            return mi.load_dict(still.scene)
 
-        name = f"still-{args.seed}-{index}"
-        names = [f"{name}-{view}" for view in range(args.views)]
-        yield Base(name, names, args.seed * 100003 + 50000 + index * 16, budget, load)
+def still_life(args, index: int) -> tuple[Still, np.random.Generator]:
+    """A still life, and the numbers that go on to its cameras."""
+    rng = np.random.default_rng([args.seed, index, 4])
+    still = Still(rng, args.grain, np.random.default_rng([args.seed, index, 5]))
+    lamps = np.random.default_rng([args.seed, index, 6])
+    if lamps.random() < args.studio:
+        still.darken(lamps)
+    return still, rng
 
 
 def write_manifest(args, left_out: dict[str, str]) -> None:
@@ -143,6 +144,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--sun", type=float, default=0.6, metavar="SHARE", help="of the rooms with windows that the sun shines into [0.6]")
     parser.add_argument("--grain", type=float, default=0.6, metavar="SHARE", help="of the colours and patterns that are boards, stone or cloth [0.6]")
     parser.add_argument("--black", type=float, default=0.2, metavar="SHARE", help="of the rooms whose bars and blinds are black [0.2]")
+    parser.add_argument("--studio", type=float, default=0.15, metavar="SHARE", help="of the still lifes that stand in a black studio [0.15]")
     parser.add_argument("--spp", type=int, default=4, metavar="N", help="samples a pixel of the noisy image [4]")
     parser.add_argument("--ref-spp", type=int, default=128, metavar="N", help="of the reference, at most [128]")
     parser.add_argument("--residual", type=float, default=0.03, metavar="X", help="expected RelMSE of a reference that is good enough [0.03]")

@@ -42,6 +42,21 @@ def sky(rng: Rng, brightness: float, skyline: bool = False) -> dict:
     return {"type": "envmap", "bitmap": mi.Bitmap((image * brightness * 4).astype(np.float32)), "to_world": to_world}
 
 
+def studio(rng: Rng) -> dict:
+    """An environment map that is black but for one to four lamps above: what is behind the things stays black to the last bit."""
+    height, width = 256, 512
+    image = np.zeros((height, width, 3))
+    for _ in range(rng.integers(1, 5)):
+        top, left = int(rng.integers(0, 60)), int(rng.integers(0, width))
+        high, wide = int(rng.integers(8, 40)), int(rng.integers(12, 90))
+        solid = np.sin(np.pi * (top + high / 2) / height) * high * wide * 2 * np.pi**2 / (height * width)
+        power = np.exp(rng.uniform(np.log(1), np.log(8))) / solid
+        columns = np.arange(left, left + wide) % width
+        image[top : top + high, columns] += power * np.array([1, rng.uniform(0.75, 1), rng.uniform(0.5, 1)])
+    to_world = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    return {"type": "envmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "to_world": to_world}
+
+
 def built(rng: Rng, image: np.ndarray) -> np.ndarray:
     """The environment map `[height, width, 3]` with blocks with windows along its horizon, and something coarse for the ground; changed in place."""
     height, width, _ = image.shape

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from furniture import Furnished
-from patterns import Rng, grain, pattern, sky
+from patterns import Rng, grain, pattern, sky, studio
 from stage import square_film, tiled
 from variant import mi
 
@@ -27,6 +27,10 @@ class Still(Furnished):
         self.ground()
         self.scene["sky"] = sky(rng, 1.0, skyline=rng.random() < 0.6)
         self.arrange()
+
+    def darken(self, rng: Rng) -> None:
+        """Lamps in a black studio for the sky."""
+        self.scene["sky"] = studio(rng)
 
     def surface(self, side: float) -> dict:
         """A material for `side` metres of floor: a pattern with detail down to a texel of a few millimetres, or centimetres on a square."""

@@ -71,6 +71,11 @@ class Headers(unittest.TestCase):
         self.assertEqual(model.config, config)
         self.assertEqual(model.latent.conv.weight.shape, (4, 4, 3, 3))
 
+    def test_its_name_tells_levels_that_are_not_the_papers(self) -> None:
+        self.assertEqual(str(demc.ModelConfig(width=3)), "demc, paper reading, width 3")
+        name = str(demc.ModelConfig(width=3, levels=(1, 2, 2, 4, 1)))
+        self.assertEqual(name, "demc, paper reading, width 3, levels of [3, 6, 6, 12, 3]")
+
     def test_levels_are_five(self) -> None:
         for levels in ([1, 2, 4, 8], [1, 2, 4, 8, 0]):
             self.meta["model"]["levels"] = levels

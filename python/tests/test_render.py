@@ -191,6 +191,27 @@ class Render(unittest.TestCase):
         sharp, wide = np.sum(between, axis=0)
         self.assertGreater(wide, 1.5 * sharp)
 
+    def test_a_studio_is_black_behind_things_that_are_lit(self) -> None:
+        import mitsuba as mi
+        import numpy as np
+        import tracer
+        from stills import Still
+
+        behind, lit = 0, []
+        for seed in range(6):
+            still = Still(np.random.default_rng(seed))
+            still.darken(np.random.default_rng(seed))
+            scene = mi.load_dict(still.scene | {"camera": still.camera(np.random.default_rng(seed), SIDE)})
+            image = tracer.render(scene, 16, 1)
+            # None of a pixel's samples hit anything: not a trace of light.
+            missed = image.features["mask"][..., 0] == 0
+            self.assertEqual(np.abs(image.color[missed]).sum(), 0)
+            self.assertEqual(np.abs(image.features["albedo1"][missed]).sum(), 0)
+            behind += missed.sum()
+            lit.append(np.median(image.color[~missed].max(-1)) / 16)
+        self.assertGreater(behind, SIDE**2 / 4)
+        self.assertGreater(np.median(lit), 0.05)
+
     def test_a_data_set_is_the_same_for_one_seed_and_goes_on_where_it_stopped(self) -> None:
         for kind in ("--rooms", "--stills"):
             with self.subTest(kind):

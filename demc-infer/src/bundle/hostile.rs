@@ -170,6 +170,11 @@ fn entries_that_lie_are_refused() {
             "model.width = 1000000000",
         ),
         (r#"\"width\":2"#, r#"\"width\":-2"#, "invalid value"),
+        (
+            r#"\"levels\":[1,2,4,8,8]"#,
+            r#"\"levels\":[1,2,4,8,0]"#,
+            "model.levels = [1, 2, 4, 8, 0]",
+        ),
         (r#"\"width\":2"#, r#"\"width\":[[[[2]]]]"#, "invalid type"),
         (
             r#"\"gamma\":2.2"#,

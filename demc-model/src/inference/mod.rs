@@ -89,7 +89,7 @@ fn forward_with(
 /// How an image is cut.
 #[derive(Clone, Copy)]
 struct Plan {
-    /// Rows of a band. At every level a row is as many values and as much work: as the width halves, the channels double.
+    /// Rows of a band. At every level a row is as many values and as much work where the channels double, as the paper's do, while the width halves.
     band: usize,
     /// Threads that share the work on a band.
     threads: usize,

@@ -16,6 +16,7 @@ use demc_infer::evaluate::Report;
 
 use crate::checkpoint::Store;
 use crate::config::Config;
+use crate::initial::read_init;
 use crate::metrics_log;
 use crate::progress::say;
 use crate::session::{Manner, Outcome, Session};
@@ -52,8 +53,9 @@ pub struct Finished {
 /// Trains every run of `spec` that is not complete, and compares them. `device` is plain.
 ///
 /// # Errors
-/// A run that cannot be trained or read; runs without a test split.
+/// A run that cannot be trained or read; runs without a test split; before anything is trained, a `train.init` that does not fit.
 pub fn run(spec: &Spec, device: &Device, device_name: &str) -> anyhow::Result<Ended> {
+    check_init(spec)?;
     let total = spec.seeds.len() * spec.variants.len();
     let mut runs = vec![Vec::new(); spec.variants.len()];
     let mut number = 0;
@@ -90,6 +92,19 @@ pub fn run(spec: &Spec, device: &Device, device_name: &str) -> anyhow::Result<En
         }
     }
     Ok(Ended::Done(Comparison::new(spec, &runs)?))
+}
+
+/// Checks that each run that has not begun can begin with what its `train.init` says: known before the first one trains for hours.
+fn check_init(spec: &Spec) -> anyhow::Result<()> {
+    for seed in &spec.seeds {
+        for variant in &spec.variants {
+            let config = spec.run(variant, *seed);
+            if !config.run.dir.exists() {
+                read_init(&config).with_context(|| variant.name.clone())?;
+            }
+        }
+    }
+    Ok(())
 }
 
 /// The scores of a run that is complete; `None` of one that is not.

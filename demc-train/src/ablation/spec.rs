@@ -234,22 +234,25 @@ mod tests {
 
     /// Tests run in the folder of their crate, `base` starts at that of the workspace.
     #[test]
-    fn the_ablation_that_comes_along_can_run() {
-        let workspace = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
-        let configs = Path::new(workspace).join("configs");
-        let text = std::fs::read_to_string(configs.join("ablation.toml")).unwrap();
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("ablation.toml");
-        let base = format!("base = \"{}/", configs.display());
-        assert!(text.contains("base = \"configs/"));
-        std::fs::write(&path, text.replace("base = \"configs/", &base)).unwrap();
-        let spec = Spec::load(&path, &[]).unwrap();
-        let names: Vec<_> = spec.variants.iter().map(|v| &v.name).collect();
-        assert_eq!(names, ["DEMC", "DEMCnoSN", "SEMC", "color-only"]);
-        assert_eq!(
-            spec.differences(),
-            ["color-only: data.demodulate = 0, there 0.07"]
-        );
+    fn the_ablations_that_come_along_can_run() {
+        let workspace = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/.."));
+        let no_texture = "color-only: data.demodulate = 0, there 0.07";
+        for (folder, differences) in [("configs", vec![no_texture]), ("results/renders", vec![])] {
+            let folder = workspace.join(folder);
+            let text = std::fs::read_to_string(folder.join("ablation.toml")).unwrap();
+            let relative = text
+                .lines()
+                .find(|line| line.starts_with("base = "))
+                .unwrap();
+            let base = workspace.join(relative["base = ".len()..].trim_matches('"'));
+            let dir = tempfile::tempdir().unwrap();
+            let path = dir.path().join("ablation.toml");
+            std::fs::write(&path, text.replace(relative, &format!("base = {base:?}"))).unwrap();
+            let spec = Spec::load(&path, &[]).unwrap();
+            let names: Vec<_> = spec.variants.iter().map(|v| &v.name).collect();
+            assert_eq!(names, ["DEMC", "DEMCnoSN", "SEMC", "color-only"]);
+            assert_eq!(spec.differences(), differences);
+        }
     }
 
     #[test]

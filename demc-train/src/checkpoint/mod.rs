@@ -31,7 +31,7 @@ use crate::config::TrainConfig;
 use crate::optimizer::Optimizer;
 use crate::run_dir::OWN_FILES;
 use crate::watch::Watch;
-pub use store::{Found, Keep, Store};
+pub use store::{Found, Keep, Store, sha256_of};
 
 /// Version of a checkpoint's files; goes up when a meaning changes.
 pub const FORMAT: u32 = 2;

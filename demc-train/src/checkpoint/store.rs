@@ -198,7 +198,7 @@ fn fill(
         fs::hard_link(from, &to)
             .or_else(|_| fs::copy(from, &to).map(drop))
             .with_context(|| to.display().to_string())?;
-        let _ = writeln!(sums, "{}  {name}", sum_of(&to)?);
+        let _ = writeln!(sums, "{}  {name}", sha256_of(&to)?);
     }
     write_synced(&dir.join(SUMS), sums.as_bytes())?;
     sync(dir)
@@ -226,7 +226,7 @@ fn verify(dir: &Path) -> anyhow::Result<()> {
             bail!("{}: a line without a checksum: {line}", path.display());
         };
         let file = dir.join(name);
-        if sum_of(&file)? != sum {
+        if sha256_of(&file)? != sum {
             bail!("{}: damaged, not what its checksum says", file.display());
         }
     }
@@ -236,7 +236,11 @@ fn verify(dir: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn sum_of(path: &Path) -> anyhow::Result<String> {
+/// The SHA-256 of a file, in hexadecimal digits.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn sha256_of(path: &Path) -> anyhow::Result<String> {
     let read = || -> std::io::Result<String> {
         let mut file = File::open(path)?;
         let (mut sum, mut piece) = (Sha256::new(), vec![0; PIECE]);
