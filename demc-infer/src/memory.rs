@@ -43,7 +43,7 @@ pub fn pass_bytes(ops: Ops, config: &ModelConfig, height: usize, width: usize) -
         Ops::Burn => {
             // Of the fusion sub-network and of each level, a quarter of the pixels from one to the next.
             let levels = config.level_channels().into_iter().enumerate();
-            let maps = levels.map(|(level, channels)| channels * (height * width) >> (2 * level));
+            let maps = levels.map(|(level, channels)| (channels * height * width) >> (2 * level));
             let largest = maps.fold(config.width * height * width, usize::max);
             STOCK_VALUES * largest as u64 * size_of::<f32>() as u64
         }

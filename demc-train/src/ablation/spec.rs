@@ -244,7 +244,7 @@ mod tests {
                 .lines()
                 .find(|line| line.starts_with("base = "))
                 .unwrap();
-            let base = workspace.join(relative["base = ".len()..].trim_matches('"'));
+            let base = workspace.join(relative.split('"').nth(1).unwrap());
             let dir = tempfile::tempdir().unwrap();
             let path = dir.path().join("ablation.toml");
             std::fs::write(&path, text.replace(relative, &format!("base = {base:?}"))).unwrap();
