@@ -37,9 +37,7 @@ def sky(rng: Rng, brightness: float, skyline: bool = False) -> dict:
         image += sun * power * np.array([1, rng.uniform(0.75, 1), rng.uniform(0.5, 1)])
     if skyline:
         image = built(rng, image)
-    # Mitsuba's maps have y up.
-    to_world = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
-    return {"type": "envmap", "bitmap": mi.Bitmap((image * brightness * 4).astype(np.float32)), "to_world": to_world}
+    return environment(image * brightness * 4)
 
 
 def studio(rng: Rng) -> dict:
@@ -53,6 +51,12 @@ def studio(rng: Rng) -> dict:
         power = np.exp(rng.uniform(np.log(1), np.log(8))) / solid
         columns = np.arange(left, left + wide) % width
         image[top : top + high, columns] += power * np.array([1, rng.uniform(0.75, 1), rng.uniform(0.5, 1)])
+    return environment(image)
+
+
+def environment(image: np.ndarray) -> dict:
+    """What shines from all around, `[height, width, 3]` from the zenith down."""
+    # Mitsuba's maps have y up.
     to_world = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
     return {"type": "envmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "to_world": to_world}
 
