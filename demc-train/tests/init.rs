@@ -3,7 +3,7 @@
 mod common;
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
 use common::{config, error_line, stderr, train};
@@ -26,6 +26,27 @@ fn assert_same(ours: &Path, theirs: &Path) {
         assert_eq!(name, same);
         let mut pairs = ours.iter().zip(theirs);
         assert!(pairs.all(|(a, b)| (a - b).abs() < 1e-29), "{name}");
+    }
+}
+
+/// A run of two steps, and what one that begins with its weights is told.
+struct Begun {
+    config: PathBuf,
+    /// `train.init=RUN`
+    init: String,
+    /// The directory of the other run, not there yet.
+    second: PathBuf,
+}
+
+fn begun(dir: &Path) -> Begun {
+    let config = config(dir);
+    let first = dir.join("first");
+    let output = train(&config, &first, &["--set", "train.steps=2"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    Begun {
+        config,
+        init: format!("train.init={}", first.display()),
+        second: dir.join("second"),
     }
 }
 
@@ -105,12 +126,11 @@ fn ranges_of_the_scenes_before_are_kept() {
 #[test]
 fn weights_that_saw_another_colour_are_told() {
     let dir = tempfile::tempdir().expect("a temporary directory");
-    let config = config(dir.path());
-    let (first, second) = (dir.path().join("first"), dir.path().join("second"));
-    let output = train(&config, &first, &["--set", "train.steps=2"]);
-    assert!(output.status.success(), "{}", stderr(&output));
-
-    let init = format!("train.init={}", first.display());
+    let Begun {
+        config,
+        init,
+        second,
+    } = begun(dir.path());
     let note = |demodulate: &str| {
         let set = format!("data.demodulate={demodulate}");
         let output = train(
@@ -132,12 +152,11 @@ fn weights_that_saw_another_colour_are_told() {
 #[test]
 fn weights_that_do_not_fit_are_refused_before_anything_is_written() {
     let dir = tempfile::tempdir().expect("a temporary directory");
-    let config = config(dir.path());
-    let (first, second) = (dir.path().join("first"), dir.path().join("second"));
-    let output = train(&config, &first, &["--set", "train.steps=2"]);
-    assert!(output.status.success(), "{}", stderr(&output));
-
-    let init = format!("train.init={}", first.display());
+    let Begun {
+        config,
+        init,
+        second,
+    } = begun(dir.path());
     let wider = ["--set", &init, "--set", "model.width=3"];
     let line = error_line(&train(&config, &second, &wider), 1);
     assert!(line.contains("train.init"), "{line}");
