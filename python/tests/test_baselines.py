@@ -1,6 +1,6 @@
-"""`tools/baselines.py` on the repository's sample: `python -m unittest discover -s tests`, in `python/`.
+"""`tools/baselines.py` and `tools/references.py` on the repository's sample: `python -m unittest discover -s tests`, in `python/`.
 
-Skipped without what the tool needs (numpy, OpenEXR, pyoidn, scikit-image, PyWavelets), unless DEMC_REQUIRE_BASELINES=1.
+Skipped without what the tools need (numpy, OpenEXR, pyoidn, scikit-image, PyWavelets), unless DEMC_REQUIRE_BASELINES=1.
 """
 
 import importlib.util
@@ -12,29 +12,34 @@ import unittest
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-TOOL = ROOT / "python" / "tools" / "baselines.py"
+TOOLS = ROOT / "python" / "tools"
 SAMPLE = ROOT / "data" / "sample"
 NEEDED = ["numpy", "OpenEXR", "pyoidn", "skimage", "pywt"]
 MISSING = [name for name in NEEDED if importlib.util.find_spec(name) is None]
 
 
-def run(*arguments: object) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, TOOL, *map(str, arguments)], capture_output=True, text=True)
+def run(tool: str, *arguments: object) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, TOOLS / f"{tool}.py", *map(str, arguments)], capture_output=True, text=True)
 
 
 @unittest.skipIf(MISSING and os.environ.get("DEMC_REQUIRE_BASELINES") != "1", f"no {', '.join(MISSING)}")
-class Baselines(unittest.TestCase):
+class Tools(unittest.TestCase):
+    """The tools' own directory comes first."""
+
+    def setUp(self) -> None:
+        sys.path.insert(0, str(TOOLS))
+        self.addCleanup(sys.path.remove, str(TOOLS))
+
+
+class Baselines(Tools):
     def relmse(self, denoiser: str) -> list[tuple[float, float]]:
         """RelMSE of the noisy and of the denoised image, by scene."""
         import numpy as np
-
-        sys.path.insert(0, str(TOOL.parent))
-        self.addCleanup(sys.path.remove, str(TOOL.parent))
-        from baselines import Scene
+        from dataset import Scene
 
         scores = []
         with tempfile.TemporaryDirectory() as out:
-            ended = run(denoiser, "--data", SAMPLE, "-o", out)
+            ended = run("baselines", denoiser, "--data", SAMPLE, "-o", out)
             self.assertEqual(ended.returncode, 0, ended.stderr)
             scenes = sorted((SAMPLE / "test").glob("*.exr"))
             self.assertEqual(sorted(os.listdir(out)), [scene.name for scene in scenes])
@@ -62,10 +67,52 @@ class Baselines(unittest.TestCase):
 
     def test_a_directory_without_manifest_is_one_line(self) -> None:
         with tempfile.TemporaryDirectory() as empty:
-            ended = run("nlm", "--data", empty, "-o", empty)
+            ended = run("baselines", "nlm", "--data", empty, "-o", empty)
         self.assertEqual(ended.returncode, 1)
         self.assertEqual(ended.stderr.count("\n"), 1, ended.stderr)
         self.assertTrue(ended.stderr.startswith("error: "))
+
+
+class References(Tools):
+    def test_training_references_are_cleaner_and_all_else_is_as_it_was(self) -> None:
+        import numpy as np
+        from dataset import Scene, manifest
+        from references import noise
+
+        with tempfile.TemporaryDirectory() as out:
+            for _ in range(2):
+                ended = run("references", "--data", SAMPLE, "-o", out)
+                self.assertEqual(ended.returncode, 0, ended.stderr)
+            before, after = manifest(SAMPLE)["scenes"], manifest(Path(out))["scenes"]
+            self.assertEqual([scene["name"] for scene in before], [scene["name"] for scene in after])
+            for old, new in zip(before, after):
+                was, now = Scene(SAMPLE / old["file"]), Scene(Path(out) / new["file"])
+                if old["split"] != "train":
+                    self.assertTrue(os.path.samefile(was.path, now.path))
+                    continue
+                self.assertEqual(was.about, now.about)
+                self.assertEqual(list(was.channels), list(now.channels))
+                for name in was.channels:
+                    self.assertEqual(was.channels[name].dtype, now.channels[name].dtype)
+                    if not name.startswith("ref."):
+                        np.testing.assert_array_equal(was.channels[name], now.channels[name])
+                raw, clean = was.rgb("ref.").clip(0), now.rgb("ref.")
+                level = lambda image: float(noise(np.log(image + 0.02).mean(-1)).mean())
+                self.assertLess(level(clean), level(raw))
+                self.assertLess(abs(clean.mean() / raw.mean() - 1), 0.02)
+
+    def test_what_the_samples_say_is_black_stays_dark(self) -> None:
+        import numpy as np
+        from references import clean
+
+        # Bars of one pixel before a window, which Open Image Denoise by itself lightens.
+        flat = np.full((64, 64, 3), 0.5, np.float32)
+        window = np.where((np.arange(64) % 8 == 3)[None, :, None], 0, 4 * flat)
+        self.assertLess(clean(window, flat, flat)[:, 3::8].max(), 0.002)
+
+    def test_a_data_set_is_not_written_over(self) -> None:
+        ended = run("references", "--data", SAMPLE, "-o", SAMPLE)
+        self.assertEqual((ended.returncode, ended.stderr.count("\n")), (1, 1), ended.stderr)
 
 
 if __name__ == "__main__":

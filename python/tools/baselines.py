@@ -13,36 +13,34 @@ One EXR file with R, G, B a scene, named as the scene's file. Files that are the
 """
 
 import argparse
-import json
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
+from dataset import Scene, as_kind, scenes, write
 
 LOG_SCALE = 16
 """What radiance is multiplied by before log(1 + x): noise in the dark and in the light gets about the same size."""
 
 
-def oidn(image: "Scene", color: str = "") -> np.ndarray:
+def oidn(image: Scene, color: str = "") -> np.ndarray:
     import pyoidn
 
     return pyoidn.denoise(image.rgb(color), albedo=image.rgb("albedo1."), normal=image.rgb("normal.", "XYZ"), hdr=True)
 
 
-def oidn_color(image: "Scene") -> np.ndarray:
+def oidn_color(image: Scene) -> np.ndarray:
     import pyoidn
 
     return pyoidn.denoise(image.rgb(""), hdr=True)
 
 
-def oidn_reference(image: "Scene") -> np.ndarray:
+def oidn_reference(image: Scene) -> np.ndarray:
     return oidn(image, color="ref.")
 
 
-def nlm(image: "Scene") -> np.ndarray:
+def nlm(image: Scene) -> np.ndarray:
     from skimage.restoration import denoise_nl_means, estimate_sigma
 
     log = np.log1p(LOG_SCALE * image.rgb("").clip(0))
@@ -53,49 +51,12 @@ def nlm(image: "Scene") -> np.ndarray:
     return np.expm1(clean) / LOG_SCALE
 
 
-DENOISERS: dict[str, Callable[["Scene"], np.ndarray]] = {
+DENOISERS: dict[str, Callable[[Scene], np.ndarray]] = {
     "oidn": oidn,
     "oidn-color": oidn_color,
     "oidn-reference": oidn_reference,
     "nlm": nlm,
 }
-
-
-class Scene:
-    """An EXR file's channels."""
-
-    def __init__(self, path: Path) -> None:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            self.channels = {name: channel.pixels for name, channel in file.channels().items()}
-        self.path = path
-
-    def rgb(self, prefix: str, names: str = "RGB") -> np.ndarray:
-        """Three channels as float32 [H, W, 3]."""
-        wanted = [prefix + name for name in names]
-        missing = [name for name in wanted if name not in self.channels]
-        if missing:
-            raise ValueError(f"{self.path}: no channel {', '.join(missing)}")
-        return np.ascontiguousarray(np.stack([self.channels[name] for name in wanted], -1), np.float32)
-
-
-def scenes(data: Path, split: str) -> list[Path]:
-    """The files of a split, as the manifest lists them."""
-    manifest = json.loads((data / "manifest.json").read_text())
-    found = [data / scene["file"] for scene in manifest["scenes"] if scene["split"] == split]
-    if not found:
-        raise ValueError(f"{data / 'manifest.json'}: no scenes in split {split}")
-    return found
-
-
-def write(path: Path, rgb: np.ndarray) -> None:
-    """R, G, B as half, whole or not at all."""
-    half = np.finfo(np.float16)
-    rgb = rgb.clip(half.min, half.max).astype(np.float16)
-    channels = {name: np.ascontiguousarray(rgb[..., i]) for i, name in enumerate("RGB")}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    unfinished = path.with_name(f".{path.stem}.unfinished.exr")
-    OpenEXR.File(header, channels).write(str(unfinished))
-    os.replace(unfinished, path)
 
 
 def main() -> int:
@@ -112,7 +73,8 @@ def main() -> int:
             bad = int((~np.isfinite(clean)).sum())
             if bad:
                 raise ValueError(f"{path}: {arguments.denoiser} gave {bad} NaN or infinite values")
-            write(arguments.output / f"{path.stem}.exr", clean)
+            planes = {name: as_kind(clean[..., i], np.dtype(np.float16)) for i, name in enumerate("RGB")}
+            write(arguments.output / f"{path.stem}.exr", planes)
     except (OSError, ValueError, RuntimeError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

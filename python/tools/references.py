@@ -1,0 +1,97 @@
+"""A data set again, the references that are trained on denoised by Intel's Open Image Denoise.
+
+    pip install numpy OpenEXR pyoidn
+    python python/tools/references.py --data data/rooms -o data/clean
+    demc-train --config configs/renders.toml --set data.root=data/clean --set data.reference_filter=false
+
+For references of some hundred samples, whose own noise hides structure: Open Image Denoise, at so many samples, leaves more of it than
+`data.reference_filter` does (results/renders). Where it would lighten what the samples say is dark by more than their noise explains, a black
+slat before a window, the samples are believed. All other channels are copied, scenes of other splits are listed where they are, and what is there
+already is kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+from dataset import Scene, as_kind, manifest, write, write_manifest
+
+LIGHTER = 3.0
+"""Standard deviations of the noise that a pixel may get lighter by."""
+LEAST_NOISE, MOST_NOISE = 0.01, 1.0
+LOG_OFFSET = 0.02
+"""Added to radiance before the logarithm: black has one."""
+BLOCK, MARGIN = 16, 8
+"""Noise is measured once for a block of pixels, over it and so many more on each side."""
+MAD = 1.4826
+"""From the median of absolute values to the standard deviation of a normal distribution."""
+
+
+def clean(reference: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """The reference denoised; all `[H, W, 3]` float32, in linear HDR. Negative samples count as 0."""
+    import pyoidn
+
+    samples = reference.clip(0)
+    deviation = noise(np.log(samples + LOG_OFFSET).mean(-1))[..., None]
+    most = (samples + LOG_OFFSET) * np.exp(LIGHTER * deviation) - LOG_OFFSET
+    return np.minimum(pyoidn.denoise(samples, albedo=albedo, normal=normal, hdr=True), most)
+
+
+def noise(plane: np.ndarray) -> np.ndarray:
+    """Standard deviation of the noise around each pixel, `[H, W]`: from how far pixels are from the mean of their four neighbours, by block
+    (`demc-data`'s `reference_filter` measures it so)."""
+    padded = np.pad(plane, 1, mode="edge")
+    neighbours = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]
+    distance = np.abs(plane - neighbours / 4)
+    out = np.empty_like(plane)
+    for top in range(0, plane.shape[0], BLOCK):
+        for left in range(0, plane.shape[1], BLOCK):
+            rows, columns = (slice(max(0, start - MARGIN), start + BLOCK + MARGIN) for start in (top, left))
+            # A pixel less the mean of four has 5/4 of one pixel's variance.
+            out[top : top + BLOCK, left : left + BLOCK] = MAD * np.median(distance[rows, columns]) / 1.25**0.5
+    return out.clip(LEAST_NOISE, MOST_NOISE)
+
+
+def rewrite(source: Path, target: Path) -> None:
+    scene = Scene(source)
+    cleaned = clean(scene.rgb("ref."), scene.rgb("albedo1."), scene.rgb("normal.", "XYZ"))
+    if not np.isfinite(cleaned).all():
+        raise ValueError(f"{source}: the denoised reference has NaN or infinite values")
+    for i, name in enumerate("RGB"):
+        scene.channels["ref." + name] = as_kind(cleaned[..., i], scene.channels["ref." + name].dtype)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write(target, scene.channels, scene.about)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="the directory with manifest.json")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="directory of the new data set, made if needed")
+    arguments = parser.parse_args()
+    data, output = arguments.data, arguments.output
+    try:
+        if output.resolve() == data.resolve():
+            raise ValueError(f"{output} is the data set itself")
+        listed = manifest(data)
+        output.mkdir(parents=True, exist_ok=True)
+        for scene in listed["scenes"]:
+            source = data / scene["file"]
+            if scene["split"] == "train":
+                scene |= {"file": f"train/{scene['name']}.exr", "ref_denoised": "Open Image Denoise"}
+                if not (output / scene["file"]).exists():
+                    rewrite(source, output / scene["file"])
+            else:
+                scene["file"] = os.path.relpath(source.resolve(), output.resolve())
+        write_manifest(output, listed)
+    except (OSError, ValueError, KeyError, RuntimeError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
