@@ -59,7 +59,7 @@ impl SceneCache {
         }
     }
 
-    /// The same, with every reference filtered as it is decoded ([`crate::reference_filter`]) if `on`.
+    /// The same, with references filtered as they are decoded ([`crate::reference_filter`]) if `on`, but those that are denoised already.
     pub fn with_reference_filter(self, on: bool) -> Self {
         Self {
             reference_filter: on,
@@ -95,7 +95,7 @@ impl SceneCache {
         if let Some(error) = size_mismatch(scene, planes.width, planes.height) {
             return Err(error);
         }
-        if self.reference_filter {
+        if self.reference_filter && scene.ref_denoised.is_none() {
             filter_reference(&mut planes);
         }
         let planes = Arc::new(planes);

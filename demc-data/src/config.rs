@@ -70,7 +70,7 @@ pub struct DataConfig {
     pub validation: f64,
     /// Augmentation: `true` (all), `false` or a list of `"flip"`, `"transpose"`, `"rgb"`, `"exposure"`, `"axes"`, `"crop"` and `"noise"`.
     pub augment: Augment,
-    /// Filter the training scenes' references ([`crate::reference_filter`]): for references with visible noise.
+    /// Filter the training scenes' references ([`crate::reference_filter`]), but those that are denoised already: for references with visible noise.
     pub reference_filter: bool,
     /// Memory for decoded scenes, in MiB, at most 2^24.
     pub cache_mib: usize,

@@ -54,6 +54,8 @@ pub struct Scene {
     pub height: usize,
     /// Expected RelMSE of the reference against a perfect one, where it is known.
     pub ref_residual_relmse: Option<f64>,
+    /// What has denoised the reference, where something has: [`crate::reference_filter`] leaves it as it is.
+    pub ref_denoised: Option<String>,
     /// The other keys of its manifest entry: licences, credits, render settings.
     pub other: serde_json::Map<String, serde_json::Value>,
 }
@@ -87,6 +89,7 @@ struct Entry {
     width: usize,
     height: usize,
     ref_residual_relmse: Option<f64>,
+    ref_denoised: Option<String>,
     #[serde(flatten)]
     other: serde_json::Map<String, serde_json::Value>,
 }
@@ -189,6 +192,7 @@ fn parse(root: &Path, text: &str) -> Result<Vec<Scene>, String> {
         width: entry.width,
         height: entry.height,
         ref_residual_relmse: entry.ref_residual_relmse,
+        ref_denoised: entry.ref_denoised,
         other: entry.other,
     };
     Ok(scenes.into_iter().map(scene).collect())

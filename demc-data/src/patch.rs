@@ -106,6 +106,7 @@ mod tests {
             width,
             height,
             ref_residual_relmse: None,
+            ref_denoised: None,
             other: serde_json::Map::new(),
         }
     }

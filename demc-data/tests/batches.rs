@@ -233,6 +233,20 @@ fn the_reference_filter_changes_references_and_nothing_else() {
 }
 
 #[test]
+fn a_denoised_reference_is_not_filtered() {
+    let mut scenes = train_scenes();
+    scenes[1].ref_denoised = Some("some denoiser".to_owned());
+    let references = |filter| {
+        let cache = SceneCache::new(scenes.clone(), layout(), usize::MAX);
+        let cache = cache.with_reference_filter(filter);
+        [0, 1].map(|i| cache.get(i).expect("sound").reference.clone())
+    };
+    let (plain, filtered) = (references(false), references(true));
+    assert_ne!(plain[0], filtered[0]);
+    assert_eq!(plain[1], filtered[1]);
+}
+
+#[test]
 fn threads_that_want_one_scene_decode_it_once() {
     let cache = SceneCache::new(train_scenes(), layout(), usize::MAX);
     std::thread::scope(|scope| {

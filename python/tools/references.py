@@ -2,12 +2,12 @@
 
     pip install numpy OpenEXR pyoidn
     python python/tools/references.py --data data/rooms -o data/clean
-    demc-train --config configs/renders.toml --set data.root=data/clean --set data.reference_filter=false
+    demc-train --config configs/renders.toml --set data.root=data/clean
 
 For references of some hundred samples, whose own noise hides structure: Open Image Denoise, at so many samples, leaves more of it than
 `data.reference_filter` does (results/renders). Where it would lighten what the samples say is dark by more than their noise explains, a black
-slat before a window, the samples are believed. All other channels are copied, scenes of other splits are listed where they are, and what is there
-already is kept.
+slat before a window, the samples are believed. All other channels are copied, scenes of the test split are listed where they are, and what is there
+already is kept unless its source is newer. In the manifest `ref_denoised` tells the trainer, whose own filter leaves such references alone.
 """
 
 from __future__ import annotations
@@ -56,6 +56,11 @@ def noise(plane: np.ndarray) -> np.ndarray:
     return out.clip(LEAST_NOISE, MOST_NOISE)
 
 
+def older(target: Path, source: Path) -> bool:
+    """Whether the target is missing, or not of the source as it is now."""
+    return not target.exists() or target.stat().st_mtime < source.stat().st_mtime
+
+
 def rewrite(source: Path, target: Path) -> None:
     scene = Scene(source)
     cleaned = clean(scene.rgb("ref."), scene.rgb("albedo1."), scene.rgb("normal.", "XYZ"))
@@ -78,15 +83,19 @@ def main() -> int:
             raise ValueError(f"{output} is the data set itself")
         listed = manifest(data)
         output.mkdir(parents=True, exist_ok=True)
+        denoised = 0
         for scene in listed["scenes"]:
             source = data / scene["file"]
             if scene["split"] == "train":
                 scene |= {"file": f"train/{scene['name']}.exr", "ref_denoised": "Open Image Denoise"}
-                if not (output / scene["file"]).exists():
+                scene.pop("ref_residual_relmse", None)
+                if older(output / scene["file"], source):
                     rewrite(source, output / scene["file"])
+                    denoised += 1
             else:
                 scene["file"] = os.path.relpath(source.resolve(), output.resolve())
         write_manifest(output, listed)
+        print(f"{output}: {denoised} references denoised, {len(listed['scenes'])} scenes listed")
     except (OSError, ValueError, KeyError, RuntimeError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
