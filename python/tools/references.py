@@ -42,8 +42,8 @@ def clean(reference: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.n
 
 
 def noise(plane: np.ndarray) -> np.ndarray:
-    """Standard deviation of the noise around each pixel, `[H, W]`: from how far pixels are from the mean of their four neighbours, by block
-    (`demc-data`'s `reference_filter` measures it so)."""
+    """Standard deviation of the noise around each pixel, `[H, W]`: from how far pixels are from the mean of their four neighbours, by block, as
+    `demc-data`'s `reference_filter` measures it."""
     padded = np.pad(plane, 1, mode="edge")
     neighbours = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]
     distance = np.abs(plane - neighbours / 4)
@@ -56,7 +56,7 @@ def noise(plane: np.ndarray) -> np.ndarray:
     return out.clip(LEAST_NOISE, MOST_NOISE)
 
 
-def older(target: Path, source: Path) -> bool:
+def stale(target: Path, source: Path) -> bool:
     """Whether the target is missing, or not of the source as it is now."""
     return not target.exists() or target.stat().st_mtime < source.stat().st_mtime
 
@@ -89,7 +89,7 @@ def main() -> int:
             if scene["split"] == "train":
                 scene |= {"file": f"train/{scene['name']}.exr", "ref_denoised": "Open Image Denoise"}
                 scene.pop("ref_residual_relmse", None)
-                if older(output / scene["file"], source):
+                if stale(output / scene["file"], source):
                     rewrite(source, output / scene["file"])
                     denoised += 1
             else:
