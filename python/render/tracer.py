@@ -54,7 +54,7 @@ def trace_pixels(scene, sensor, width: int, height: int, count: int, seed: int, 
     paths = width * height * count
     sampler = mi.load_dict({"type": "independent"})
     # Mitsuba hashes a seed and an index: neighbours are not correlated.
-    sampler.seed(seed, paths)
+    sampler.seed(seed % (1 << 32), paths)
     # Opaque: one kernel for any number of samples.
     pixel = dr.arange(mi.UInt32, paths) // dr.opaque(mi.UInt32, count)
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))

@@ -24,6 +24,8 @@ PASS_SAMPLES = 16
 EPSILON = 0.001
 """Eq. 5."""
 CHANNELS = {"normal.": "XYZ", "position.": "XYZ", "albedo1.": "RGB", "albedo2.": "RGB", "mask.": "A"}
+GUIDES = ("normal", "albedo1")
+"""Features that the reference keeps of its own samples, for `tools/references.py`."""
 
 
 class Unsuitable(Exception):
@@ -61,11 +63,12 @@ def photograph(scene, view: int, seed: int, budget: Budget) -> tuple[dict[str, n
 
     noisy = tracer.render(scene, budget.samples, seed + 10, clamp, view)
     color = noisy.color / noisy.count * scale
-    halves, count = [0.0, 0.0], 0
+    halves, count, guides = [0.0, 0.0], 0, dict.fromkeys(GUIDES, 0.0)
     while True:
         for half in range(2):
             traced = tracer.render(scene, PASS_SAMPLES, seed + 100 + count + PASS_SAMPLES * half, clamp, view)
             halves[half] = halves[half] + traced.color / traced.count
+            guides = {name: sum + traced.features[name] for name, sum in guides.items()}
         count += 2 * PASS_SAMPLES
         a, b = (half / (count / (2 * PASS_SAMPLES)) * scale for half in halves)
         reference = (a + b) / 2
@@ -79,6 +82,8 @@ def photograph(scene, view: int, seed: int, budget: Budget) -> tuple[dict[str, n
     buffers = {"": ("RGB", color), "ref.": ("RGB", reference)}
     for (prefix, names), name in zip(CHANNELS.items(), tracer.FEATURES):
         buffers[prefix] = (names, noisy.features[name] / noisy.count)
+        if name in GUIDES:
+            buffers["ref." + prefix] = (names, guides[name] / count)
     channels = {}
     for prefix, (names, planes) in buffers.items():
         kind = np.float32 if prefix == "position." and too_coarse(planes) else np.float16

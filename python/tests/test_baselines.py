@@ -57,8 +57,10 @@ class Baselines(Tools):
 
     def test_features_help_and_a_reference_needs_none(self) -> None:
         clean = lambda denoiser: sum(clean for _, clean in self.relmse(denoiser))
-        reference, features, color = map(clean, ["oidn-reference", "oidn", "oidn-color"])
+        reference, prefilter, features, color = map(clean, ["oidn-reference", "oidn-prefilter", "oidn", "oidn-color"])
         self.assertLess(reference, 0.5 * features)
+        self.assertNotAlmostEqual(prefilter / features, 1, places=2)
+        self.assertLess(prefilter, color)
         self.assertLess(features, color)
 
     def test_non_local_means_takes_some_of_the_error_away(self) -> None:
@@ -109,6 +111,22 @@ class References(Tools):
         flat = np.full((64, 64, 3), 0.5, np.float32)
         window = np.where((np.arange(64) % 8 == 3)[None, :, None], 0, 4 * flat)
         self.assertLess(clean(window, flat, flat)[:, 3::8].max(), 0.002)
+
+    def test_guides_are_of_the_references_samples_where_they_are_there(self) -> None:
+        import numpy as np
+        from dataset import Scene, manifest
+        from oidn import prefiltered
+        from references import guide
+
+        scene = Scene(SAMPLE / manifest(SAMPLE)["scenes"][0]["file"])
+        albedo = guide(scene, "albedo1.", "RGB")
+        np.testing.assert_array_equal(albedo, scene.rgb("albedo1."))
+        scene.channels |= {f"ref.albedo1.{name}": np.full_like(scene.channels["ref.R"], 0.25) for name in "RGB"}
+        np.testing.assert_array_equal(guide(scene, "albedo1.", "RGB"), np.full_like(albedo, 0.25))
+        # Noise is less than half, and what is below it still there.
+        noise = np.random.default_rng(1).normal(0, 0.1, albedo.shape).astype(np.float32)
+        after = prefiltered("albedo", (albedo + noise).clip(0, 1)) - albedo
+        self.assertLess(np.abs(after).mean(), 0.5 * np.abs(noise).mean())
 
     def test_a_data_set_is_not_written_over(self) -> None:
         ended = run("references", "--data", SAMPLE, "-o", SAMPLE)

@@ -241,6 +241,25 @@ class Render(unittest.TestCase):
             both = json.loads((first / "manifest.json").read_text())["scenes"]
             self.assertEqual([scene["file"] for scene in both[len(scenes) :]], [f"../second/{scene['file']}" for scene in scenes])
 
+    def test_a_reference_keeps_features_of_its_own_samples(self) -> None:
+        import numpy as np
+        import OpenEXR
+
+        with tempfile.TemporaryDirectory() as out:
+            # A seed whose samples' numbers are past 32 bits.
+            ended = run("-o", out, "--stills", 1, "--views", 2, "--size", 64, "--ref-spp", 64, "--seed", 60)
+            self.assertEqual(ended.returncode, 0, ended.stderr)
+            files = sorted(Path(out).glob("train/*.exr"))
+            self.assertTrue(files)
+            for path in files:
+                with OpenEXR.File(str(path), separate_channels=True) as file:
+                    planes = {name: channel.pixels.astype(float) for name, channel in file.channels().items()}
+                for name in ("normal.X", "normal.Y", "normal.Z", "albedo1.R", "albedo1.G", "albedo1.B"):
+                    few, many = planes[name], planes["ref." + name]
+                    self.assertLess(abs(few.mean() - many.mean()), 0.02, name)
+                    step = lambda plane: np.abs(plane[:, :-2] - 2 * plane[:, 1:-1] + plane[:, 2:]).mean()
+                    self.assertLess(step(many), step(few), name)
+
     def test_nothing_to_render_is_said(self) -> None:
         with tempfile.TemporaryDirectory() as empty:
             ended = run("-o", empty)

@@ -6,7 +6,8 @@
 
 For references of some hundred samples, whose own noise hides structure: Open Image Denoise, at so many samples, leaves more of it than
 `data.reference_filter` does (results/renders). Where it would lighten what the samples say is dark by more than their noise explains, a black
-slat before a window, the samples are believed. All other channels are copied, scenes of the test split are listed where they are, and what is there
+slat before a window, the samples are believed. Its guides are texture and normals, denoised by themselves first: those of the reference's own samples
+where the file has them (`ref.albedo1.R`, `ref.normal.X`, ...: python/render writes them), else those of the noisy image. All other channels are copied, scenes of the test split are listed where they are, and what is there
 already is kept unless its source is newer. In the manifest `ref_denoised` tells the trainer, whose own filter leaves such references alone.
 """
 
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from dataset import Scene, as_kind, manifest, write, write_manifest
+from oidn import with_prefilter
 
 LIGHTER = 3.0
 """Standard deviations of the noise that a pixel may get lighter by."""
@@ -33,12 +35,16 @@ MAD = 1.4826
 
 def clean(reference: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """The reference denoised; all `[H, W, 3]` float32, in linear HDR. Negative samples count as 0."""
-    import pyoidn
-
     samples = reference.clip(0)
     deviation = noise(np.log(samples + LOG_OFFSET).mean(-1))[..., None]
     most = (samples + LOG_OFFSET) * np.exp(LIGHTER * deviation) - LOG_OFFSET
-    return np.minimum(pyoidn.denoise(samples, albedo=albedo, normal=normal, hdr=True), most)
+    return np.minimum(with_prefilter(samples, albedo, normal), most)
+
+
+def guide(scene: Scene, prefix: str, names: str) -> np.ndarray:
+    """A feature of the reference's own samples where the file has it (python/render writes it), else of the noisy image's."""
+    of_reference = f"ref.{prefix}{names[0]}" in scene.channels
+    return scene.rgb(f"ref.{prefix}" if of_reference else prefix, names)
 
 
 def noise(plane: np.ndarray) -> np.ndarray:
@@ -63,7 +69,7 @@ def stale(target: Path, source: Path) -> bool:
 
 def rewrite(source: Path, target: Path) -> None:
     scene = Scene(source)
-    cleaned = clean(scene.rgb("ref."), scene.rgb("albedo1."), scene.rgb("normal.", "XYZ"))
+    cleaned = clean(scene.rgb("ref."), guide(scene, "albedo1.", "RGB"), guide(scene, "normal.", "XYZ"))
     if not np.isfinite(cleaned).all():
         raise ValueError(f"{source}: the denoised reference has NaN or infinite values")
     for i, name in enumerate("RGB"):

@@ -1,0 +1,34 @@
+"""Open Image Denoise on features that it has denoised by themselves first, as its documentation advises for the best quality."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def with_prefilter(color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Linear HDR colour denoised by albedo and normals; all `[H, W, 3]` float32."""
+    import pyoidn
+
+    # What is clean may be believed.
+    return pyoidn.denoise(color, albedo=prefiltered("albedo", albedo), normal=prefiltered("normal", normal), hdr=True, clean_aux=True)
+
+
+def prefiltered(kind: str, feature: np.ndarray) -> np.ndarray:
+    """One feature, `albedo` or `normal`, denoised with nothing else to go by."""
+    import pyoidn
+
+    out = np.empty_like(feature)
+    with pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CPU) as device:
+        device.commit()
+        filter = pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT)
+        try:
+            filter.set_image(kind, feature, pyoidn.OIDN_FORMAT_FLOAT3)
+            filter.set_image(pyoidn.OIDN_IMAGE_OUTPUT, out, pyoidn.OIDN_FORMAT_FLOAT3)
+            filter.commit()
+            filter.execute()
+            message = device.get_error()
+        finally:
+            filter.release()
+    if message is not None:
+        raise RuntimeError(f"Open Image Denoise, {kind} alone: {message}")
+    return out
