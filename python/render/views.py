@@ -68,7 +68,7 @@ def photograph(scene, view: int, seed: int, budget: Budget) -> tuple[dict[str, n
         for half in range(2):
             traced = tracer.render(scene, PASS_SAMPLES, seed + 100 + count + PASS_SAMPLES * half, clamp, view)
             halves[half] = halves[half] + traced.color / traced.count
-            guides = {name: sum + traced.features[name] for name, sum in guides.items()}
+            guides = {name: total + traced.features[name] for name, total in guides.items()}
         count += 2 * PASS_SAMPLES
         a, b = (half / (count / (2 * PASS_SAMPLES)) * scale for half in halves)
         reference = (a + b) / 2

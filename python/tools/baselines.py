@@ -5,8 +5,8 @@
     python python/tools/baselines.py nlm --data data/sample -o nlm/
 
 `oidn` is Intel's Open Image Denoise, given what it asks for: HDR colour, the albedo of the first hit, normals (both noisy,
-so without its `cleanAux`). `oidn-prefilter` has it denoise albedo and normals by themselves first and then believe them, in three times
-the time, what its documentation calls the best quality. `oidn-color` is the same without features, `oidn-reference` the same of the *references*: their own
+so without its `cleanAux`). `oidn-prefilter` has it denoise albedo and normals by themselves first and then believe them, as its
+documentation advises for the best quality. `oidn-color` is the same without features, `oidn-reference` the same of the *references*: their own
 noise taken away, about as near to them as anything can get. `nlm` is non-local means of scikit-image on log(1 + 16 x), which knows of no features; its
 strength is the noise that scikit-image estimates in each image.
 
