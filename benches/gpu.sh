@@ -1,31 +1,31 @@
 #!/usr/bin/env bash
-# What this project does on a machine with a GPU: parity, speed against PyTorch on the same GPU, memory over many steps.
+# Tests this project on a machine with a GPU: parity, speed relative to PyTorch, memory over many steps.
 #
-#   benches/gpu.sh pack DIR [wgpu,cuda]     where it can be built: makes DIR, which holds everything and needs no network
-#   DIR/benches/gpu.sh run [OPTIONS]        where the GPU is: writes DIR/benches/results/gpu-NAME.md and .json beside it
+#   benches/gpu.sh pack DIR [wgpu,cuda]     on the build machine: makes DIR, which needs no network
+#   DIR/benches/gpu.sh run [OPTIONS]        on the GPU machine: writes DIR/benches/results/gpu-NAME.md and .json
 #
-# The GPU's machine needs its driver (Vulkan for wgpu; CUDA with NVRTC for cuda) and a glibc no older than the builder's.
-# Where it has python3, PyTorch and safetensors, PyTorch computes on the same GPU in f32, tf32 and bf16; else it is
-# named as missing. Without python3 there are times of this project only. Nothing is installed.
+# The GPU machine needs a driver (Vulkan for wgpu; CUDA with NVRTC for cuda) and a glibc at least as new as that of the
+# build machine. With python3, PyTorch and safetensors, PyTorch runs on the same GPU in f32, tf32 and bf16. Without
+# PyTorch, the report names it as missing; without python3, it has times of this project only. Nothing is installed.
 #
 # Options of run:
-#   --name NAME         in the report's file name; default: the GPU's
-#   --devices "A B"     default "wgpu cuda": those that the build or the machine lacks are named and left out
+#   --name NAME         part of the report's file name; default: the name of the GPU
+#   --devices "A B"     default "wgpu cuda"; the report names missing devices and leaves them out
 #   --cases "A B"       see benches/peers/run.py; default: the paper's network in a training step and at 1280x720
-#   --torch-device D    cuda or cpu; default: cuda where nvidia-smi is
-#   --steps N           of the memory test; default 500
+#   --torch-device D    cuda or cpu; default: cuda if nvidia-smi exists
+#   --steps N           steps of the memory test; default 500
 #   --rounds N          default 5
 #   --python P          an interpreter with PyTorch; default python3
-#   --small             tiny cases and 20 steps, to try this script on Mesa's software Vulkan
+#   --small             tiny cases and 20 steps, for a trial on Mesa's software Vulkan
 set -euo pipefail
 ROOT=$(cd "$(dirname "$0")/.." && pwd)
 PEER=$ROOT/target/release/peer
 PARITY=$ROOT/target/release/parity
-PARTS=10  # of the memory test
+PARTS=10  # measurements of the memory test
 
 fail() { echo "error: $*" >&2; exit 1; }
 
-# DIR mirrors the repository, so that every script finds its neighbours.
+# DIR mirrors the layout of the repository, so that the scripts find each other.
 pack() {
     local to=$1 features=${2-wgpu,cuda} built
     cd "$ROOT"
@@ -42,15 +42,15 @@ pack() {
     echo "packed: $(du -sh "$to" | cut -f1) in $to"
 }
 
-# Files of the case SIZE... at width C, for the direct use of `peer`.
+# Writes the case WIDTH SIZE... for direct use of `peer`.
 make_case() { "$PEER" make --width "$1" --size "${@:2}" --weights "$WORK/weights" --inputs "$WORK/inputs"; }
 
 files() { printf -- '--weights\n%s\n--inputs\n%s\n' "$WORK/weights" "$WORK/inputs"; }
 
-# Why a device cannot be used; empty where it can.
+# The reason why a device cannot be used, or nothing.
 trouble() { { "$PEER" infer $(files) --device "$1" </dev/null >/dev/null || true; } 2>&1 | grep -a '^error' | tail -1 || true; }
 
-# Notes that something failed; the report is written in a pipe, which keeps no variables.
+# Records a failure in a file, because the report runs in a pipe, which loses variables.
 bad() { touch "$WORK/bad"; }
 
 parity() {
@@ -68,7 +68,7 @@ speed() {
     local device=$1 command=(--device "$1" --torch-device "$TORCH_DEVICE" --rounds "$ROUNDS" --only PyTorch)
     echo; echo "### Speed"; echo
     if ! command -v "$PYTHON" >/dev/null; then
-        echo "No $PYTHON here: this project alone, after 3 steps to warm up."
+        echo "$PYTHON is missing: this project alone, after 3 warm-up steps."
         make_case 64 4 128 128
         printf 'step 3\nstep 10\nmemory\n' | "$PEER" train $(files) --lr 1e-4 --device "$device" | sed 's/^/    /' || bad
         make_case 64 1 736 1280
@@ -78,11 +78,11 @@ speed() {
     "$PYTHON" "$ROOT/benches/peers/run.py" "${command[@]}" --cases $CASES --out "${REPORT%.md}-$device.json" || bad
 }
 
-# GPU memory and this process's resident set after each part of the steps.
+# Prints GPU memory and the resident set of the process after each part of the steps.
 memory() {
     local device=$1 part=$((STEPS / PARTS)) answer pid i
     echo; echo "### Memory over $STEPS training steps (width $WIDTH, batch $BATCH)"; echo
-    echo "| step | GPU MiB used, all processes | host MiB | ms a step |"
+    echo "| step | GPU MiB used, all processes | host MiB | ms per step |"
     echo "|---:|---:|---:|---:|"
     make_case "$WIDTH" $BATCH
     coproc TRAINING { exec "$PEER" train $(files) --lr 1e-4 --device "$device"; }
@@ -90,7 +90,7 @@ memory() {
     read -r _ <&"${TRAINING[0]}" || { bad; return; }
     for ((i = 1; i <= PARTS; i++)); do
         echo "step $part" >&"${TRAINING[1]}"
-        read -r answer <&"${TRAINING[0]}" || { echo; echo "It ended at step $(((i - 1) * part))."; bad; return; }
+        read -r answer <&"${TRAINING[0]}" || { echo; echo "The process ended after step $(((i - 1) * part))."; bad; return; }
         echo "| $((i * part)) | $(gpu_memory) | $(awk '/VmRSS/ {printf "%d", $2 / 1024}' "/proc/$pid/status") |" \
             "$(awk -F'[:}]' '{printf "%.1f", 1000 * $2}' <<<"$answer") |"
     done

@@ -1,4 +1,4 @@
-"""How long `demc-infer report` takes on 20 images of 1280x720, mosaics of the sample's scenes: programs take turns.
+"""Times `demc-infer report` on 20 images of 1280x720, mosaics of the sample's scenes. Programs take turns.
 
     pip install numpy OpenEXR
     python benches/report.py target/release/demc-infer [OTHER/demc-infer] [--rounds 3]
@@ -21,7 +21,7 @@ IMAGES, HEIGHT, WIDTH, TILE = 20, 720, 1280, 224
 
 
 def mosaics(folder: Path) -> None:
-    """A data set of `IMAGES` test scenes, each of tiles drawn from the sample's scenes."""
+    """Writes a data set of `IMAGES` test scenes, each made of random tiles of the sample's scenes."""
     manifest = json.loads((SAMPLE / "manifest.json").read_text())
     tiles = []
     for scene in manifest["scenes"]:

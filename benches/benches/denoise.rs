@@ -1,13 +1,14 @@
-//! What tiles cost, and what share of denoising a file is reading and writing it.
+//! The cost of tiles, and the share of reading and writing in denoising a file.
 //!
 //! ```sh
 //! cargo bench -p demc-bench --bench denoise                        # width 32, the sample's classroom
 //! cargo bench -p demc-bench --bench denoise -- 16 my-render.exr    # another width, another file
-//! cargo bench -p demc-bench --bench denoise -- files               # only one of both: tiles, files
+//! cargo bench -p demc-bench --bench denoise -- files               # only one part: tiles or files
 //! ```
 //!
-//! Tiles: 1280x720 pixels in memory, repeated from the file, whole and cut as a limit of memory cuts it, in turns. Files: read, denoised and
-//! written with all their channels, each part timed, in turns.
+//! Tiles: 1280x720 pixels in memory, repeated from the file, whole and in the tiles of two memory
+//! limits, in turns. Files: read, denoised and written with all channels; each part is timed in
+//! turns.
 
 use std::cell::RefCell;
 use std::path::{Path, PathBuf};
@@ -20,12 +21,12 @@ use demc_data::exr::rewrite::{WriteOptions, rewrite};
 use demc_data::frame::{decode_input, read_input};
 use demc_infer::{Bundle, Ensemble, Tiling};
 
-/// That of the binaries.
+/// The allocator of the binaries.
 #[global_allocator]
 static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
 
 const ROUNDS: usize = 7;
-/// As `demc-infer denoise` does.
+/// The limit of `demc-infer denoise`.
 const KEPT_BYTES: usize = 256 << 20;
 const WIDTH: usize = 1280;
 const HEIGHT: usize = 720;
@@ -56,19 +57,19 @@ fn run() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Whole, in the tiles of half the memory, and in those with a smaller halo.
+/// Denoises the image whole, and with three quarters and half of the memory.
 fn tiles(bundle: &Bundle, frame: &Frame) -> anyhow::Result<()> {
     let whole = bundle.pass_bytes(HEIGHT.next_multiple_of(32), WIDTH);
-    let of = |memory: u64, halo: usize| Tiling {
+    let tiling = |memory: u64, halo: usize| Tiling {
         halo,
         side: None,
         memory: Some(memory),
     };
     let exact = Tiling::default().halo;
     let cuts = [
-        of(whole, exact),
-        of(whole * 3 / 4, exact),
-        of(whole / 2, exact),
+        tiling(whole, exact),
+        tiling(whole * 3 / 4, exact),
+        tiling(whole / 2, exact),
     ];
     let run = |tiling: &Tiling| {
         let denoised = bundle.denoise_tiled(frame, tiling, Ensemble::One, |_, _| ());
@@ -80,7 +81,9 @@ fn tiles(bundle: &Bundle, frame: &Frame) -> anyhow::Result<()> {
             run(&cuts[2])
         }],
     );
-    println!("| {WIDTH}x{HEIGHT} | tiles | memory of a pass, MiB | pixels | s | times the whole |");
+    println!(
+        "| {WIDTH}x{HEIGHT} | tiles | memory of a pass, MiB | pixels | s | relative to whole |"
+    );
     println!("|---|---:|---:|---:|---:|---:|");
     for (cut, times) in cuts.iter().zip(&turns) {
         let plan = bundle.tiles(HEIGHT, WIDTH, cut, Ensemble::One)?;
@@ -105,14 +108,14 @@ fn tiles(bundle: &Bundle, frame: &Frame) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Each part of what `demc-infer denoise` does with a file.
+/// Times each part of `demc-infer denoise` for one file.
 fn files(bundle: &Bundle, file: &Path) -> anyhow::Result<()> {
     let layout = &bundle.meta.layout;
     let frame = read_input(file, layout)?;
     let image = bundle.denoise(&frame)?;
     let directory = tempfile::tempdir()?;
     let output = directory.path().join("out.exr");
-    // Reading leaves the open file to writing.
+    // Writing uses the file that reading opened.
     let open = RefCell::new(None);
     let [read, denoise, write] = interleaved(
         ROUNDS,
@@ -129,7 +132,7 @@ fn files(bundle: &Bundle, file: &Path) -> anyhow::Result<()> {
             },
             &mut || {
                 let options = WriteOptions::default();
-                // Read before, unless this is the second time in one turn.
+                // Already open, unless this is the second call in one turn.
                 let again = || ExrFile::open(file).expect("it was read before");
                 let mut input = open.take().unwrap_or_else(again);
                 let written = rewrite(&mut input, layout, &image, &output, &options);
@@ -159,7 +162,7 @@ fn files(bundle: &Bundle, file: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The image beside and below itself until it has the size.
+/// Repeats the image until it has the size of the bench.
 fn repeated(frame: &Frame) -> Frame {
     let planes = |planes: &[f32]| -> Vec<f32> {
         planes

@@ -1,13 +1,13 @@
-//! How many patches a second the loader gives, and how many a training step eats.
+//! Patches per second that the loader delivers and that a training step consumes.
 //!
 //! ```sh
-//! cargo bench -p demc-bench --bench loader            # a step at base width 16, the hungriest of the paper's sizes here
+//! cargo bench -p demc-bench --bench loader            # a step at base width 16, the fastest one
 //! cargo bench -p demc-bench --bench loader -- 32
 //! ```
 //!
-//! Cold: every scene is decoded from its EXR for the first patch that is cut from it. Cached: scenes are in memory. Both run
-//! one worker, the configuration's default, and nothing else; in training the worker and the step share the cores, so
-//! the loader must be faster by far, not just faster.
+//! Cold: every scene is decoded from its EXR for its first patch. Cached: scenes are in memory.
+//! Both run one worker, the configuration's default. In training, worker and step share the cores,
+//! so the loader must be much faster than the step.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -18,8 +18,9 @@ use demc_bench::case;
 use demc_bench::contender::Training;
 use demc_bench::stopwatch::Spread;
 use demc_data::{BatchLoader, ChannelLayout, DataConfig, Dataset, PatchSource, Statistics};
+use demc_model::LossConfig;
 
-/// That of the binaries.
+/// The allocator of the binaries.
 #[global_allocator]
 static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
 
@@ -64,7 +65,7 @@ fn main() -> anyhow::Result<()> {
     let names = [
         "loader, cold".to_string(),
         "loader, cached".to_string(),
-        format!("eaten by a step at width {width}"),
+        format!("consumed by a step at width {width}"),
     ];
     let spreads = rates.map(Spread::of);
     for (name, spread) in names.iter().zip(spreads) {
@@ -74,19 +75,25 @@ fn main() -> anyhow::Result<()> {
         );
     }
     println!(
-        "\nThe loader gives {:.1} times what the step eats when cold, {:.1} times when cached.",
+        "\nThe loader delivers {:.1} times what the step consumes when cold, {:.1} times when cached.",
         spreads[0].median / spreads[2].median,
         spreads[1].median / spreads[2].median
     );
     Ok(())
 }
 
-/// The sample's training scenes, none decoded yet.
+/// The sample's training scenes, not yet decoded.
 fn open(config: &DataConfig) -> anyhow::Result<PatchSource> {
     let layout = ChannelLayout::resolve(&config.layout)?;
     let dataset = Dataset::open(&config.root, &layout)?;
     let (scenes, _) = dataset.train_validation(config.validation, 1)?;
-    let statistics = Statistics::measure(&scenes, &layout, config.gamma, config.demodulate)?;
+    let statistics = Statistics::measure(
+        &scenes,
+        &layout,
+        config.gamma,
+        None,
+        LossConfig::default().relmse_epsilon,
+    )?;
     Ok(PatchSource::new(
         config,
         scenes,

@@ -1,14 +1,14 @@
-"""A peer in the comparison that `run.py` makes: reads commands from stdin, answers each with a line of JSON.
+"""A peer for `run.py`. It reads commands from stdin and answers each with a line of JSON.
 
-The commands are those of this project's own contender (`benches/src/main.rs`), and one more:
+The commands are those of this project's contender (`benches/src/main.rs`), and `warm`:
 
-    (start)      {"ready": what this is}
+    (start)      {"ready": description}
     check FILE   inference: {"zeros": share}, the output in FILE; training: {"losses", "grad_norms"} of 3 steps
-    warm         {"choice": which of several ways was fastest}; after it, nothing is compiled any more
+    warm         {"choice": the fastest implementation}; all compilation ends here
     step N       {"seconds": of one step, on average}
     memory       {"peak_mib": peak of the resident set}
 
-`contender.py export` writes the ONNX file instead, so that its memory is not counted as a runtime's.
+`contender.py export` writes the ONNX file in a separate process, so that its memory does not count for the runtime.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from typing import Callable
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "python"))
 
 NAMES = ("color_gamma", "features_z")
-CHECK_STEPS = 3  # the third loss sees what two steps made of the weights
-WARM_SECONDS = 1.0  # at least this long, and two steps, before anything is timed
+CHECK_STEPS = 3  # the third loss depends on two updates of the weights
+WARM_SECONDS = 1.0  # minimum warm-up before timing, with at least two steps
 QUICK_WARM_SECONDS = 0.05
 
 
 class TorchTraining:
-    """Forward, loss, backward and Adam of the twin in python/."""
+    """Forward, loss, backward and Adam of the PyTorch implementation in python/."""
 
     ADAMS = {"fused": {"fused": True}, "foreach": {"foreach": True}}
 
@@ -46,7 +46,7 @@ class TorchTraining:
         return f"PyTorch {self.torch.__version__}"
 
     def reset(self, adam: str) -> None:
-        """The first weights again and a fresh Adam (Sec. 4.2)."""
+        """Restores the initial weights, with a new Adam (Sec. 4.2)."""
         self.model.load_state_dict(self.start)
         self.adam = self.torch.optim.Adam(
             self.model.parameters(), lr=self.lr, betas=(0.9, 0.999), eps=1e-8, **self.ADAMS[adam]
@@ -78,7 +78,7 @@ class TorchTraining:
             answers.append({"losses": losses, "grad_norms": norms})
         first, second = (a["losses"] for a in answers)
         if any(abs(a - b) > 1e-3 * abs(a) for a, b in zip(first, second)):
-            raise RuntimeError(f"the ways to compute Adam differ: {first} and {second}")
+            raise RuntimeError(f"the implementations of Adam differ: {first} and {second}")
         return answers[0]
 
     def warm(self) -> str:
@@ -94,7 +94,7 @@ class TorchTraining:
 
 
 class Inference:
-    """What inferences have in common: `run` gives the output as a NumPy array."""
+    """Base class of inferences: `run` returns the output as a NumPy array."""
 
     run: Callable
     quick: bool
@@ -147,7 +147,7 @@ class OpenVinoInference(Inference):
     def __init__(self, args: argparse.Namespace) -> None:
         import openvino
 
-        # f32: by default it computes in bf16 where the processor can, which is another comparison.
+        # f32, because the default is bf16 on processors that support it.
         options = {
             "INFERENCE_NUM_THREADS": args.threads,
             "NUM_STREAMS": 1,
@@ -164,7 +164,7 @@ class OpenVinoInference(Inference):
 
 
 def load_torch(args: argparse.Namespace):
-    """torch, the twin with the case's weights, and the case's three inputs, in the layout of `args.kind`."""
+    """Returns torch, the model with the case's weights, and the three inputs, in the layout of `args.kind`."""
     import torch
     from safetensors.torch import load_file
 
@@ -193,12 +193,12 @@ def autocast(torch, device: str, dtype: str):
 
 
 def export(args: argparse.Namespace) -> None:
-    """The network with fixed sizes: what the runtimes like best."""
+    """Exports the network with fixed sizes, which the runtimes execute fastest."""
     import torch
 
     args.kind, args.device, args.dtype = "nchw", "cpu", "f32"
     _, model, inputs = load_torch(args)
-    # The exporter that needs no further package (`onnxscript`); it warns that it is the older one.
+    # The older exporter, which warns about its age, but does not need `onnxscript`.
     torch.onnx.export(
         model.eval(), tuple(inputs[:2]), args.onnx, dynamo=False, opset_version=17, input_names=list(NAMES)
     )
@@ -264,10 +264,10 @@ def main() -> None:
     parser.add_argument("--lr", type=float)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--dtype", choices=("f32", "tf32", "bf16"), default="f32")
-    parser.add_argument("--quick", action="store_true", help="hardly warm up")
+    parser.add_argument("--quick", action="store_true", help="short warm-up")
     args = parser.parse_args()
 
-    # What libraries print must not get between the answers.
+    # Output of libraries must not mix with the answers.
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     if args.mode == "export":

@@ -1,4 +1,4 @@
-"""The report of a comparison: a Markdown table for people, JSON with everything beside."""
+"""The report of a comparison: a Markdown table, and JSON with all data."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def mib(value: float | None) -> str:
 
 
 def markdown(comparisons: list[Comparison], args: argparse.Namespace) -> str:
-    """A row a case against its best peer, then every peer."""
+    """One row per case with its best peer, then all peers."""
     about = sorted({result.about.split(",")[0] for c in comparisons for result in c.results})
     ours = sorted({comparison.ours for comparison in comparisons})
     lines = [

@@ -5,15 +5,16 @@
     .venv/bin/pip install "torch>=2.9" numpy safetensors onnx onnxruntime openvino
     .venv/bin/python benches/peers/run.py --out peers.md --out peers.json
 
-Installs nothing itself; a peer that is missing is named and left out. torch.compile needs a C++ compiler. Cases are
+This script installs nothing. It names missing peers and leaves them out. torch.compile needs a C++ compiler. Cases are
 training steps (forward, loss, backward, Adam) and inferences of DEMC in the paper's reading; `--list` names them.
 
-Each contender is a process of its own (`peer` of demc-bench, `contender.py`) that computes on command and is stopped
-(SIGSTOP) while it has no turn. First, what they compute must agree: outputs of inference, and of training the losses
-and norms of the gradient over 3 steps of Adam. Then each peer and this project take turns, A B A B, after a warm-up
-that no clock sees. A ratio is the peer's time over this project's in one round (above 1: this project is faster); given are
-the ratio of the medians, and the smallest and largest of the rounds. Memory is the peak of the resident set (VmHWM)
-from the start of the process to its end.
+Each contender is a separate process (`peer` of demc-bench, or `contender.py`) that computes on command. It is stopped
+(SIGSTOP) between its turns. First, the results must agree: outputs of inference, or losses and gradient norms over 3
+steps of Adam. Then each peer and this project take turns (A B A B), after a warm-up that is not timed.
+
+A ratio is the peer's time over this project's in one round (above 1: this project is faster). The report gives the
+ratio of the medians, and the minimum and maximum over the rounds. Memory is the peak of the resident set (VmHWM) over
+the life of the process.
 """
 
 from __future__ import annotations
@@ -38,12 +39,15 @@ from report import Comparison, Result, as_json, machine, markdown
 HERE = Path(__file__).resolve().parent
 LEARNING_RATE = 1e-4  # Sec. 4.2
 QUICK_TURN_SECONDS = 0.05
-QUIET = 0.05  # share of the machine that other processes may take in a turn before the report says so
-TURN_SECONDS = 1.0  # a turn takes as many steps as fit, and at least one
-# What peers may deviate by: outputs, of the largest value; and losses and norms, relative. f32: rounding takes 2e-6 of an
-# output and, after two steps of Adam, 2e-5 of a loss or norm at C = 16, 4e-4 at C = 64 (at ten times the learning rate 4e-3, since Adam's first step
-# is as long for a gradient that is all rounding as for a large one). The other two, on GPUs, keep 10 and 8 bits; their
-# bounds are a guess until a GPU has been at hand.
+QUIET = 0.05  # maximum share of the machine for other processes in a turn; above it, the report adds a note
+TURN_SECONDS = 1.0  # a turn has as many steps as fit, at least one
+# Maximum deviation of peers: outputs relative to their largest value; losses and norms relative to their value.
+#
+# f32: rounding takes 2e-6 of an output. After two steps of Adam it takes 2e-5 of a loss or norm at C = 16, and 4e-4 at
+# C = 64. At ten times the learning rate it takes 4e-3. Adam's first step is equally long for all gradients, even for
+# pure rounding noise.
+#
+# tf32 and bf16, on GPUs, keep 10 and 8 bits. Their bounds are estimates.
 TOLERANCES = {"f32": (1e-4, 1e-3), "tf32": (1e-2, 5e-2), "bf16": (1e-1, 3e-1)}
 
 
@@ -77,13 +81,13 @@ TORCH_KINDS = ("nchw", "channels_last", "compile")
 
 @dataclass
 class Peer:
-    """A way to run the network."""
+    """One runtime and configuration for the network."""
 
     name: str
     modes: tuple[str, ...]
     arguments: list[str]
     dtype: str = "f32"
-    onnx: bool = False  # whether it runs the exported network
+    onnx: bool = False  # runs the exported network
 
 
 def peers_of(device: str) -> list[Peer]:
@@ -102,11 +106,11 @@ def peers_of(device: str) -> list[Peer]:
 
 
 class Failed(Exception):
-    """A contender ended or said something else than an answer."""
+    """A contender ended, or answered with something else."""
 
 
 class Contender:
-    """A child process that computes on command; stopped between commands."""
+    """A child process that computes on command and is stopped between commands."""
 
     def __init__(self, command: list[str], environment: dict[str, str]) -> None:
         self.errors = tempfile.TemporaryFile("w+")
@@ -117,7 +121,7 @@ class Contender:
             stderr=self.errors,
             text=True,
             env=environment,
-            start_new_session=True,  # a group of its own, with its compiler's processes
+            start_new_session=True,  # a separate group that includes the processes of its compiler
         )
         try:
             self.about = self._answer()["ready"]
@@ -126,7 +130,7 @@ class Contender:
             raise
 
     def step(self, count: int) -> tuple[float, float]:
-        """Milliseconds of one of `count` steps, and how much of the machine others used meanwhile, 0 to 1."""
+        """Milliseconds per step over `count` steps, and the share of the machine used by other processes, 0 to 1."""
         busy, own, total = processor_time(self.process.pid)
         seconds = self.ask(f"step {count}")["seconds"]
         busy_after, own_after, total_after = processor_time(self.process.pid)
@@ -138,7 +142,7 @@ class Contender:
         try:
             print(command, file=self.process.stdin, flush=True)
         except BrokenPipeError:
-            pass  # the answer says why
+            pass  # reading the answer raises the cause
         return self._answer()
 
     def _answer(self) -> dict:
@@ -171,11 +175,11 @@ def main() -> int:
         print(*(case.name for case in CASES), sep="\n")
         return 0
     cases = args.cases or (QUICK if args.quick else CASES)
-    # Compiling takes a minute, the rest of a smoke run seconds.
+    # Compiling takes a minute; the rest of a smoke run takes seconds.
     peers = [peer for peer in peers_of(args.torch_device) if not args.quick or args.only or "compile" not in peer.name]
     peers = [peer for peer in peers if not args.only or any(word.lower() in peer.name.lower() for word in args.only)]
     print(machine(args), file=sys.stderr)
-    # Contenders are stopped most of the time and would outlive this script.
+    # Stopped contenders would outlive this script.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     signal.signal(signal.SIGINT, lambda *_: sys.exit(1))
     comparisons, page = [], ""
@@ -186,23 +190,23 @@ def main() -> int:
             except Failed as error:
                 print(f"error: {case.name}: {args.binary}: {error}", file=sys.stderr)
                 return 1
-            # After each case: a run can take an hour.
+            # Written after each case, because a run can take an hour.
             page = markdown(comparisons, args)
             for path in args.out:
                 path.write_text(as_json(comparisons, args) if path.suffix == ".json" else page)
     print(page)
-    # In a smoke run, a peer that disagrees or fails is an error; in a long one it is a note.
+    # In a smoke run, a peer that disagrees or fails is an error; in a long run it is a note.
     return 1 if args.quick and any("was left out" in note for c in comparisons for note in c.notes) else 0
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", nargs="+", metavar="NAME", type=Case.parse, help="as --list names them, any size")
-    parser.add_argument("--list", action="store_true", help="name the cases")
-    parser.add_argument("--only", nargs="+", metavar="PEER", help="peers whose names contain one of these words")
+    parser.add_argument("--cases", nargs="+", metavar="NAME", type=Case.parse, help="names as in --list, with any size")
+    parser.add_argument("--list", action="store_true", help="list the cases")
+    parser.add_argument("--only", nargs="+", metavar="PEER", help="only peers whose names contain one of these words")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)), help="default: all cores")
-    parser.add_argument("--quick", action="store_true", help="tiny cases, no torch.compile; fails where a peer fails")
+    parser.add_argument("--quick", action="store_true", help="tiny cases without torch.compile; fail if a peer fails")
     parser.add_argument("--out", action="append", default=[], type=Path, metavar="FILE", help=".md or .json, repeatable")
     parser.add_argument("--device", default="flex", help="this project's device: flex, wgpu, cuda")
     parser.add_argument("--torch-device", default="cpu", help="PyTorch's device: cpu, cuda")
@@ -216,7 +220,7 @@ def arguments() -> argparse.Namespace:
 
 
 def compare(case: Case, peers: list[Peer], args: argparse.Namespace, folder: Path) -> Comparison:
-    """All peers in one case, one after the other, each in turns with this project."""
+    """Compares all peers in one case, each in turns with this project."""
     files = [f"--weights={folder / 'weights'}", f"--inputs={folder / 'inputs'}"]
     size = [str(x) for x in case.size]
     environment = os.environ | {name: str(args.threads) for name in ("RAYON_NUM_THREADS", "OMP_NUM_THREADS")}
@@ -246,7 +250,7 @@ def compare(case: Case, peers: list[Peer], args: argparse.Namespace, folder: Pat
                 result.deviation = deviation(truth, check(contender, case, folder / "theirs"))
                 tolerance = TOLERANCES[peer.dtype][case.mode == "train"]
                 if not result.deviation <= tolerance:
-                    raise Failed(f"computes something else: deviation {result.deviation:.1e}, allowed {tolerance:.0e}")
+                    raise Failed(f"results differ: deviation {result.deviation:.1e}, allowed {tolerance:.0e}")
                 choice = contender.ask("warm")["choice"]
                 result.about += f", {choice}" if choice else ""
                 their_steps = turn(contender.ask("step 1")["seconds"], args)
@@ -259,8 +263,8 @@ def compare(case: Case, peers: list[Peer], args: argparse.Namespace, folder: Pat
                 results.append(result)
                 if (others := statistics.median(result.others)) > QUIET:
                     notes.append(
-                        f"{case.name}, {peer.name}: not a fair race, other processes took {others:.0%} of the machine"
-                        " (threads that wait for each other in a spin, OpenMP's, suffer most)"
+                        f"{case.name}, {peer.name}: unreliable, other processes took {others:.0%} of the machine"
+                        " (threads with spin waits, such as OpenMP's, are affected most)"
                     )
                 own_ms += result.ours_ms
             except (Failed, subprocess.CalledProcessError) as error:
@@ -278,7 +282,7 @@ def compare(case: Case, peers: list[Peer], args: argparse.Namespace, folder: Pat
 
 
 def processor_time(pid: int) -> tuple[int, int, int]:
-    """Ticks so far: of the whole machine when busy, of one process, and of the whole machine (Linux; else zeros)."""
+    """Ticks so far: busy ticks of the machine, ticks of one process, and all ticks of the machine (Linux; else zeros)."""
     try:
         whole = [int(ticks) for ticks in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
         own = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
@@ -289,29 +293,29 @@ def processor_time(pid: int) -> tuple[int, int, int]:
 
 
 def turn(seconds: float, args: argparse.Namespace) -> int:
-    """Steps in a turn."""
+    """Number of steps in a turn."""
     return max(1, int((QUICK_TURN_SECONDS if args.quick else TURN_SECONDS) / seconds))
 
 
 def reason(said: str) -> str:
-    """The line of a program's last words that tells most: an exception's name and message, or the last one."""
+    """The most informative line of a program's error output: an exception's name and message, or the last line."""
     lines = [line.strip() for line in said.splitlines() if line.strip()]
     errors = [line for line in lines if re.match(r"([\w.]*[A-Z]\w+|error): ", line)]
     return (errors or lines or [""])[-1]
 
 
 def check(contender: Contender, case: Case, path: Path) -> list[array]:
-    """What a contender computes: an image, or losses and norms."""
+    """The results of a contender: an image, or losses and norms."""
     answer = contender.ask(f"check {path}")
     if case.mode == "train":
         return [array("d", [value]) for value in (*answer["losses"], *answer["grad_norms"])]
     if answer["zeros"] > 0.5:
-        raise Failed(f"{answer['zeros']:.0%} of the output is zero: equal outputs would prove nothing")
+        raise Failed(f"{answer['zeros']:.0%} of the output is zero, so equal outputs would prove nothing")
     return [read_output(path)]
 
 
 def read_output(path: Path) -> array:
-    """The tensor `output` of a safetensors file, so that this script needs no package."""
+    """Reads the tensor `output` of a safetensors file without any package."""
     data = path.read_bytes()
     start = 8 + int.from_bytes(data[:8], "little")
     entry = json.loads(data[8:start])["output"]
@@ -321,13 +325,13 @@ def read_output(path: Path) -> array:
 
 
 def deviation(ours: list[array], theirs: list[array]) -> float:
-    """The largest difference of any quantity, as a share of its largest value; infinite where it is no number."""
+    """The largest difference of any quantity relative to its largest value; infinite for non-finite values."""
     worst = 0.0
     for a, b in zip(ours, theirs, strict=True):
         if len(a) != len(b):
             return math.inf
         share = max(abs(x - y) for x, y in zip(a, b)) / max(abs(x) for x in a)
-        # Each sum first: NaN would get lost in `max`.
+        # Checks the sums, because `max` may ignore NaN.
         worst = max(worst, share) if math.isfinite(sum(a)) and math.isfinite(sum(b)) else math.inf
     return worst
 

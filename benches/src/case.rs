@@ -1,4 +1,4 @@
-//! A case: weights and one batch, drawn here and written to files that every contender reads.
+//! A benchmark case: random weights and one random batch, in files that every contender reads.
 
 use std::path::Path;
 
@@ -6,28 +6,29 @@ use anyhow::{Context, ensure};
 use burn::tensor::Device;
 use demc_data::{Batch, ChannelLayout, FEATURES, FeatureStats, Normalizer};
 use demc_infer::{Bundle, BundleMeta, Names, Precision};
-use demc_model::{ModelConfig, Reading, Variant, Weight, Weights};
+use demc_model::{ModelConfig, Reading, Role, Variant, WeightSpec, Weights};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
-/// Of weights and inputs.
+/// Seed of weights and inputs.
 const SEED: u64 = 1;
 
-/// A batch with its height and width, which [`Batch`] takes as equal.
+/// A batch with height and width, which may differ, unlike in [`Batch`].
 #[derive(Clone, Debug, PartialEq)]
-pub struct Input {
+pub struct CaseInput {
     /// The planes.
     pub batch: Batch,
-    /// Pixels.
+    /// Height in pixels.
     pub height: usize,
-    /// Pixels.
+    /// Width in pixels.
     pub width: usize,
 }
 
-/// DEMC in the paper's reading at base width `width`, with random weights that keep all maps at order 1.
+/// DEMC in the paper's reading at base width `width`, with random weights that keep all maps at
+/// order 1.
 ///
-/// A network as training starts it would hide errors: a grey head drowns what it is given, and bilinear
+/// An initialised network would hide errors: a grey head hides its input, and bilinear
 /// deconvolutions and identity fusions are symmetric.
 pub fn network(width: usize) -> Bundle {
     let config = ModelConfig {
@@ -38,11 +39,11 @@ pub fn network(width: usize) -> Bundle {
     };
     let mut rng = ChaCha8Rng::seed_from_u64(SEED);
     let mut weights = config.init(&mut rng, [0.5; 3], &Device::flex()).weights();
-    for weight in &mut weights {
-        let (low, high) = range(weight);
+    for (weight, spec) in weights.iter_mut().zip(config.weight_specs()) {
+        let (low, high) = range(&spec);
         weight.data.fill_with(|| rng.random_range(low..high));
-        // The two convolutions to three channels: their inputs are positive, so small filters without a mean and
-        // a bias above zero keep each channel above its ReLU.
+        // The two convolutions to three channels have positive inputs. Small filters with zero mean
+        // and a positive bias keep each channel above its ReLU.
         if let [3, inputs, height, width] = weight.shape[..] {
             let len = inputs * height * width;
             for filter in weight.data.chunks_exact_mut(len) {
@@ -53,7 +54,7 @@ pub fn network(width: usize) -> Bundle {
     }
     let normalizer = Normalizer {
         gamma: 2.2,
-        demodulate: 0.0,
+        albedo_demodulation_epsilon: None,
         features: FeatureStats {
             mean: [0.0; FEATURES],
             std: [1.0; FEATURES],
@@ -69,29 +70,23 @@ pub fn network(width: usize) -> Bundle {
     }
 }
 
-/// Where a weight's values are drawn from: those of convolutions by He et al. 2015, `+-sqrt(6 / inputs of an output)`.
-fn range(weight: &Weight) -> (f32, f32) {
-    let last = weight.name.rsplit('.').next().unwrap_or_default();
-    if let [out, inputs, height, width] = weight.shape[..] {
-        // A deconvolution is [in, out, 4, 4], and with stride 2 each output sees 4 of the 16 taps.
-        let fan = match weight.name.ends_with("deconv.weight") {
-            true => out * 4,
-            false => inputs * height * width,
-        };
-        let bound = (6.0 / fan as f32).sqrt();
-        return (-bound, bound);
-    }
-    match last {
-        "bias" if weight.shape == [3] => (1.2, 1.6),
-        "gamma" => (0.8, 1.2),
-        "beta" | "running_mean" => (-0.2, 0.2),
-        "running_var" => (0.5, 1.5),
-        _ => (0.0, 0.3),
+/// The range of a weight's values. That of kernels follows He et al. 2015, `+-sqrt(6 / fan-in)`.
+fn range(spec: &WeightSpec) -> (f32, f32) {
+    match spec.role {
+        Role::Convolution | Role::Deconvolution => {
+            let bound = (6.0 / spec.fan_in() as f32).sqrt();
+            (-bound, bound)
+        }
+        Role::Bias if spec.len() == 3 => (1.2, 1.6),
+        Role::Bias => (0.0, 0.3),
+        Role::NormScale => (0.8, 1.2),
+        Role::NormShift | Role::RunningMean => (-0.2, 0.2),
+        Role::RunningVariance => (0.5, 1.5),
     }
 }
 
 /// A batch of noise.
-pub fn input(batch: usize, height: usize, width: usize) -> Input {
+pub fn input(batch: usize, height: usize, width: usize) -> CaseInput {
     let mut rng = ChaCha8Rng::seed_from_u64(SEED);
     let mut draw = |channels: usize, low: f32, high: f32| -> Vec<f32> {
         (0..batch * channels * height * width)
@@ -100,13 +95,14 @@ pub fn input(batch: usize, height: usize, width: usize) -> Input {
     };
     let batch = Batch {
         size: batch,
+        patch_size: width,
         color_gamma: draw(3, 0.0, 1.5),
         features_z: draw(FEATURES, -1.7, 1.7),
         modulation: None,
         reference_hdr: draw(3, 0.2, 2.0),
         patches: Vec::new(),
     };
-    Input {
+    CaseInput {
         batch,
         height,
         width,
@@ -116,8 +112,13 @@ pub fn input(batch: usize, height: usize, width: usize) -> Input {
 /// Writes the files that all contenders read, with PyTorch's names.
 ///
 /// # Errors
-/// A path that cannot be written.
-pub fn write(bundle: &Bundle, weights: &Path, input: &Input, inputs: &Path) -> anyhow::Result<()> {
+/// If a path cannot be written.
+pub fn write(
+    bundle: &Bundle,
+    weights: &Path,
+    input: &CaseInput,
+    inputs: &Path,
+) -> anyhow::Result<()> {
     bundle.save(weights, Names::Torch, Precision::F32)?;
     let Batch {
         color_gamma,
@@ -139,7 +140,7 @@ pub fn write(bundle: &Bundle, weights: &Path, input: &Input, inputs: &Path) -> a
 /// Writes tensors `[B, channels, H, W]` of one `[B, H, W]`.
 ///
 /// # Errors
-/// A path that cannot be written.
+/// If the path cannot be written.
 pub fn write_tensors(
     path: &Path,
     [batch, height, width]: [usize; 3],
@@ -162,11 +163,11 @@ pub fn write_tensors(
     std::fs::write(path, bytes).with_context(|| path.display().to_string())
 }
 
-/// Reads what [`write()`] wrote.
+/// Reads the inputs written by [`write()`].
 ///
 /// # Errors
-/// A file that cannot be read or holds something else.
-pub fn read_input(path: &Path) -> anyhow::Result<Input> {
+/// If the file cannot be read or has other contents.
+pub fn read_input(path: &Path) -> anyhow::Result<CaseInput> {
     let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
     let file = SafeTensors::deserialize(&bytes).with_context(|| path.display().to_string())?;
     let values = |name: &str| -> anyhow::Result<Vec<f32>> {
@@ -179,9 +180,10 @@ pub fn read_input(path: &Path) -> anyhow::Result<Input> {
         "{}: color_gamma is {shape:?}: expected [B, 3, H, W]",
         path.display()
     );
-    Ok(Input {
+    Ok(CaseInput {
         batch: Batch {
             size: shape[0],
+            patch_size: shape[3],
             color_gamma: values("color_gamma")?,
             features_z: values("features_z")?,
             modulation: None,
@@ -210,7 +212,7 @@ mod tests {
         assert_eq!(read.model.weights(), network.model.weights());
     }
 
-    /// Else contenders would agree on nothing.
+    /// Otherwise the agreement of contenders would prove nothing.
     #[test]
     fn output_and_detail_map_are_of_order_one_and_alive() {
         let device = Device::flex();

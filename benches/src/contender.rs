@@ -1,6 +1,6 @@
-//! A training step and an inference of this project, as the comparison with its peers runs them.
+//! A training step and an inference of this project, for the comparison with its peers.
 //!
-//! This is the one place that says how: what a faster way to infer or to train needs is changed here.
+//! Only this module defines them; a faster way to train or infer is adopted here.
 
 use std::convert::Infallible;
 
@@ -8,28 +8,28 @@ use burn::tensor::{Device, Tensor, TensorData};
 use demc_infer::Bundle;
 use demc_model::Denoiser;
 use demc_train::Config;
-use demc_train::optimizer::Optimizer;
-use demc_train::trainer::{Step, Trainer};
+use demc_train::step::optimizer::Optimizer;
+use demc_train::step::trainer::{StepReport, Trainer};
 
-use crate::case::Input;
+use crate::case::CaseInput;
 
-/// A network that takes the same step again and again.
+/// A network that repeats a training step on one batch.
 pub struct Training {
     trainer: Trainer,
-    input: Input,
+    input: CaseInput,
     lr: f64,
 }
 
 impl Training {
-    /// The paper's loss and optimizer (Sec. 4.2) on one batch. `device` is plain.
-    pub fn new(bundle: Bundle, input: Input, lr: f64, device: &Device) -> Self {
+    /// The paper's loss and optimizer (Sec. 4.2) on one batch. `device` has no autodiff.
+    pub fn new(bundle: Bundle, input: CaseInput, lr: f64, device: &Device) -> Self {
         let config = Config {
             model: bundle.meta.model,
             ..Config::default()
         };
         let device = device.clone().autodiff();
         let model = moved(&bundle.model, &device);
-        let optimizer = Optimizer::new(&config.train);
+        let optimizer = Optimizer::new(&config);
         Training {
             trainer: Trainer::new(&config, model, optimizer, None, device),
             input,
@@ -38,14 +38,14 @@ impl Training {
     }
 
     /// Batch to the device, forward, loss, backward, norm of the gradient, Adam.
-    pub fn run(&mut self) -> Step {
+    pub fn run(&mut self) -> StepReport {
         let batch = || Ok::<_, Infallible>(self.input.batch.clone());
-        let Ok(step) = self.trainer.step(self.lr, batch);
-        step
+        let Ok(report) = self.trainer.step(self.lr, batch);
+        report
     }
 }
 
-/// A network that denoises the same image again and again.
+/// A network that denoises one image repeatedly.
 pub struct Inference {
     model: Denoiser,
     color_gamma: Tensor<4>,
@@ -53,8 +53,8 @@ pub struct Inference {
 }
 
 impl Inference {
-    /// The input is put on `device` here: peers, too, start with tensors.
-    pub fn new(bundle: Bundle, input: Input, device: &Device) -> Self {
+    /// Copies the input to `device` first, because peers also start with tensors.
+    pub fn new(bundle: Bundle, input: CaseInput, device: &Device) -> Self {
         let tensor = |values: Vec<f32>, channels| {
             let shape = [input.batch.size, channels, input.height, input.width];
             Tensor::from_data(TensorData::new(values, shape), device)
@@ -69,7 +69,7 @@ impl Inference {
     /// The output on the host, `[B, 3, H, W]`.
     ///
     /// # Panics
-    /// Where the device fails.
+    /// If the device fails.
     pub fn run(&self) -> Vec<f32> {
         self.model
             .forward(self.color_gamma.clone(), self.features_z.clone())
@@ -78,7 +78,7 @@ impl Inference {
     }
 }
 
-/// The same network on `device`.
+/// A copy of the network on `device`.
 fn moved(model: &Denoiser, device: &Device) -> Denoiser {
     let mut weights = demc_model::Weights::new(model.weights());
     model

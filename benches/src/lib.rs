@@ -1,5 +1,5 @@
-//! What benches share: a [`case`] (weights and inputs that every contender reads), the [`contender`] that runs it with
-//! this project, and a [`stopwatch`] that compares in turns.
+//! Shared by the benches: a [`case`] (weights and inputs for every contender), this project's
+//! [`contender`], and a [`stopwatch`] that compares in turns.
 
 pub mod case;
 pub mod contender;

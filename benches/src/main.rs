@@ -1,11 +1,13 @@
-//! This project's contender in `benches/peers/run.py`: reads commands from stdin, answers each with a line of JSON.
+//! This project's contender in `benches/peers/run.py`. It reads commands from stdin and answers
+//! each with a line of JSON.
 //!
 //! | command | answer |
 //! |---|---|
-//! | (start) | `{"ready": what this is}` |
-//! | `check FILE` | inference: `{"zeros": share}`, the output in FILE; training: `{"losses", "grad_norms"}` of 3 steps |
+//! | (start) | `{"ready": description}` |
+//! | `check FILE` | inference: `{"zeros": share}`, the output in FILE; training: `{"losses",
+//! "grad_norms"}` of 3 steps |
 //! | `step N` | `{"seconds": of one step, on average}` |
-//! | `memory` | `{"peak_mib": peak of the resident set; null where the system does not tell}` |
+//! | `memory` | `{"peak_mib": peak of the resident set; null if unknown}` |
 
 use std::io::{BufRead, Write};
 use std::path::{Path, PathBuf};
@@ -14,7 +16,7 @@ use std::time::Instant;
 use anyhow::{Context, bail};
 use burn::tensor::Device;
 use clap::{Args, Parser, Subcommand};
-use demc_bench::case::{self, Input};
+use demc_bench::case::{self, CaseInput};
 use demc_bench::contender::{Inference, Training};
 use demc_infer::{Bundle, device};
 use demc_model::ops::{self, Isa, Ops};
@@ -23,18 +25,18 @@ use serde_json::{Value, json};
 #[global_allocator]
 static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
 
-/// Steps of a check: the third loss sees what two steps made of the weights.
+/// Steps of a check: the third loss depends on two updates of the weights.
 const CHECK_STEPS: usize = 3;
 
 #[derive(Parser)]
 #[command(about = "This project's contender in benches/peers/run.py", version)]
 struct Arguments {
     #[command(subcommand)]
-    command: Command,
+    command: PeerCommand,
 }
 
 #[derive(Subcommand)]
-enum Command {
+enum PeerCommand {
     /// Write weights and inputs for all contenders
     Make {
         /// Base width C
@@ -44,14 +46,14 @@ enum Command {
         #[arg(long, num_args = 3, value_names = ["B", "H", "W"])]
         size: Vec<usize>,
         #[command(flatten)]
-        files: Files,
+        files: CaseFiles,
     },
-    /// Take training steps on command
+    /// Run training steps on command
     Train {
         #[command(flatten)]
-        files: Files,
+        files: CaseFiles,
         #[command(flatten)]
-        how: How,
+        options: ComputeOptions,
         /// Learning rate
         #[arg(long)]
         lr: f64,
@@ -59,25 +61,25 @@ enum Command {
     /// Denoise on command
     Infer {
         #[command(flatten)]
-        files: Files,
+        files: CaseFiles,
         #[command(flatten)]
-        how: How,
+        options: ComputeOptions,
     },
 }
 
 #[derive(Args)]
-struct Files {
-    /// A bundle
+struct CaseFiles {
+    /// Bundle with the weights
     #[arg(long)]
     weights: PathBuf,
-    /// color_gamma, features_z, reference_hdr
+    /// File with color_gamma, features_z and reference_hdr
     #[arg(long)]
     inputs: PathBuf,
 }
 
 #[derive(Args)]
-struct How {
-    /// Where to compute: flex, ndarray, `wgpu[:N]`, `cuda[:N]`
+struct ComputeOptions {
+    /// Device: flex, ndarray, `wgpu[:N]`, `cuda[:N]`
     #[arg(long, default_value = "flex")]
     device: String,
     /// Operations on flex: kernels (the project's own) or burn
@@ -88,8 +90,8 @@ struct How {
     isa: Option<Isa>,
 }
 
-impl How {
-    /// Makes it so, and gives the device.
+impl ComputeOptions {
+    /// Applies the options and returns the device.
     fn choose(&self) -> anyhow::Result<Device> {
         ops::set_default(self.ops);
         if let Some(isa) = self.isa {
@@ -106,17 +108,17 @@ fn main() {
     }
 }
 
-fn run(command: Command) -> anyhow::Result<()> {
+fn run(command: PeerCommand) -> anyhow::Result<()> {
     match command {
-        Command::Make { width, size, files } => {
+        PeerCommand::Make { width, size, files } => {
             let input = case::input(size[0], size[1], size[2]);
             case::write(&case::network(width), &files.weights, &input, &files.inputs)
         }
-        Command::Train { files, how, lr } => {
-            let device = how.choose()?;
+        PeerCommand::Train { files, options, lr } => {
+            let device = options.choose()?;
             let (bundle, input) = files.read()?;
             let mut training = Training::new(bundle, input, lr, &device);
-            serve(&how, &device, |request| match request {
+            serve(&options, &device, |request| match request {
                 Request::Check(_) => {
                     let steps: Vec<_> = (0..CHECK_STEPS).map(|_| training.run()).collect();
                     let losses: Vec<f64> = steps.iter().map(|step| step.loss).collect();
@@ -129,12 +131,12 @@ fn run(command: Command) -> anyhow::Result<()> {
                 }
             })
         }
-        Command::Infer { files, how } => {
-            let device = how.choose()?;
+        PeerCommand::Infer { files, options } => {
+            let device = options.choose()?;
             let (bundle, input) = files.read()?;
             let size = [input.batch.size, input.height, input.width];
             let inference = Inference::new(bundle, input, &device);
-            serve(&how, &device, |request| match request {
+            serve(&options, &device, |request| match request {
                 Request::Check(path) => {
                     let out = inference.run();
                     let zeros = out.iter().filter(|x| **x == 0.0).count();
@@ -150,15 +152,15 @@ fn run(command: Command) -> anyhow::Result<()> {
     }
 }
 
-impl Files {
-    fn read(&self) -> anyhow::Result<(Bundle, Input)> {
-        // On the host's backend, which every build has; the contender moves it.
+impl CaseFiles {
+    fn read(&self) -> anyhow::Result<(Bundle, CaseInput)> {
+        // Every build has this device; the contender copies the network to another one.
         let bundle = Bundle::load(&self.weights, &Device::flex())?;
         Ok((bundle, case::read_input(&self.inputs)?))
     }
 }
 
-/// What the mode at hand must do.
+/// A request to the current mode.
 enum Request<'a> {
     Check(&'a Path),
     Step,
@@ -166,7 +168,7 @@ enum Request<'a> {
 
 /// Answers commands until stdin ends.
 fn serve(
-    how: &How,
+    options: &ComputeOptions,
     device: &Device,
     mut answer: impl FnMut(Request) -> anyhow::Result<Value>,
 ) -> anyhow::Result<()> {
@@ -178,8 +180,8 @@ fn serve(
     let version = env!("CARGO_PKG_VERSION");
     let about = format!(
         "demc {version} ({}: {})",
-        how.device,
-        how.ops.describe(device)
+        options.device,
+        options.ops.describe(device)
     );
     say(json!({"ready": about}))?;
     for line in std::io::stdin().lock().lines() {

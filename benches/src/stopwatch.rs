@@ -1,33 +1,33 @@
-//! Times in turns: A B A B, so that a machine that slows down slows down both.
+//! Timing in turns (A B A B), so that a slower machine affects both alike.
 //!
-//! Not divan (0.1.21 is its last release): it runs one bench after the other and knows no ratio of two, which is the
-//! only number that can be trusted where others use the machine too.
+//! divan (last release 0.1.21) runs one bench after the other and reports no ratio of two. On a
+//! shared machine, only that ratio is reliable.
 
 use std::time::Instant;
 
-/// How long a turn should take, so that the clock and the change of turns do not count.
+/// Minimum duration of a turn, so that clock and turn changes are negligible.
 const TURN_SECONDS: f64 = 0.02;
 
 /// Seconds of each turn, in the order of the rounds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Turns(Vec<f64>);
 
-/// The smallest, the middle and the largest of some values.
+/// Minimum, median and maximum of some values.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spread {
-    /// The smallest.
+    /// The minimum.
     pub min: f64,
-    /// The middle one; of an even number, the upper of the two.
+    /// The median; of an even number of values, the upper one.
     pub median: f64,
-    /// The largest.
+    /// The maximum.
     pub max: f64,
 }
 
 impl Spread {
-    /// Of some values.
+    /// The spread of some values.
     ///
     /// # Panics
-    /// Where there are none.
+    /// If there are no values.
     pub fn of(values: impl IntoIterator<Item = f64>) -> Self {
         let mut sorted: Vec<f64> = values.into_iter().collect();
         sorted.sort_by(f64::total_cmp);
@@ -40,18 +40,18 @@ impl Spread {
 }
 
 impl Turns {
-    /// The turns' spread, seconds.
+    /// Spread of the turns in seconds.
     pub fn spread(&self) -> Spread {
         Spread::of(self.0.iter().copied())
     }
 
-    /// How many times as long as `other` this took, round by round.
+    /// Ratio of these times to those of `other`, round by round.
     pub fn ratio(&self, other: &Turns) -> Spread {
         Spread::of(self.0.iter().zip(&other.0).map(|(a, b)| a / b))
     }
 }
 
-/// Seconds of one call of `run`, from as many as fill a turn.
+/// Seconds per call of `run`, averaged over one turn.
 pub fn turn(run: &mut dyn FnMut()) -> f64 {
     let started = Instant::now();
     let mut calls = 0;
@@ -65,7 +65,7 @@ pub fn turn(run: &mut dyn FnMut()) -> f64 {
     }
 }
 
-/// Runs all once to warm up, then each in turn, `rounds` times.
+/// Runs each once to warm up, then each in turn, `rounds` times.
 pub fn interleaved<const N: usize>(rounds: usize, runs: [&mut dyn FnMut(); N]) -> [Turns; N] {
     let mut turns = [(); N].map(|()| Turns(Vec::with_capacity(rounds)));
     let mut runs = runs;

@@ -1,23 +1,26 @@
-//! What is changed about a training patch so that it counts as another one, drawn for each patch of each epoch; off in
-//! the paper's preset (Sec. 4.2 names none).
+//! Augmentations: random changes to a training patch, drawn for each patch of each epoch. The paper
+//! names none (Sec. 4.2), so its preset has none.
 //!
-//! Flips and transposes move pixels: normals and positions are world-space values of a pixel, so they move with it and
-//! keep their numbers. Axes are what makes these numbers: which of them points up, and which way, is a renderer's choice (some say y, some z), so
-//! normals and positions may be told in other axes, the same for both. A permutation of red, green and blue is the same for colour, textures and reference, an
-//! exposure the same for colour and reference: light transport is linear in both. A crop is a patch of the same scene that
-//! need not lie on the grid: the network halves its input five times, and what is on the grid is always halved alike. Noise is drawn anew from the pixels of
-//! the same surface ([`crate::resample`]).
+//! - Flips and transposes move pixels. Normals and positions are world-space values, so they move
+//!   with their pixel and keep their numbers.
+//! - Axes: the direction that points up differs between renderers (y or z). This augmentation
+//!   permutes and mirrors the world axes, for normals and positions alike.
+//! - RGB applies one permutation of red, green and blue to colour, textures and reference.
+//! - Exposure applies one factor to colour and reference; light transport is linear in both.
+//! - A crop is a patch that need not lie on the grid. The network halves its input five times, and
+//!   patches on the grid are always halved at the same pixels.
+//! - Noise takes the noise of other pixels of the same surface ([`crate::resample`]).
 
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
 
 use crate::Patch;
-use crate::seed::{Use, generator};
+use crate::seed::{RandomStream, generator};
 
-/// An exposure is drawn between minus and plus so many stops (factors of 2); ours.
+/// Exposures are drawn between minus and plus this many stops (factors of 2); ours.
 const EXPOSURE_STOPS: f32 = 1.0;
 
-/// The orders of three: of red, green and blue, or of the world's axes.
+/// The permutations of three, for colour channels and world axes.
 const ORDERS: [[usize; 3]; 6] = [
     [0, 1, 2],
     [0, 2, 1],
@@ -27,10 +30,10 @@ const ORDERS: [[usize; 3]; 6] = [
     [2, 1, 0],
 ];
 
-/// Which augmentations are drawn. In a configuration: `true` (all), `false`, or a list of `"flip"`, `"transpose"`, `"rgb"`,
+/// Which augmentations are drawn. In a configuration: a list of `"flip"`, `"transpose"`, `"rgb"`,
 /// `"exposure"`, `"axes"`, `"crop"` and `"noise"`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "Setting", into = "Setting")]
+#[serde(from = "AugmentList", into = "AugmentList")]
 pub struct Augment {
     /// Mirror left and right, and independently top and bottom, each half of the time.
     pub flip: bool,
@@ -40,27 +43,28 @@ pub struct Augment {
     pub rgb: bool,
     /// Multiply colour and reference by `2^u`, u uniform from -1 to 1.
     pub exposure: bool,
-    /// Permute and mirror the world's axes in normals and positions, each of the 48 ways equally often.
+    /// Permute and mirror the world's axes in normals and positions, each of the 48 ways equally
+    /// often.
     pub axes: bool,
     /// Cut the patch anywhere in its scene, not on the grid.
     pub crop: bool,
-    /// Give pixels the noise of others nearby that are like them ([`crate::resample`]).
+    /// Give pixels the noise of similar pixels nearby ([`crate::resample`]).
     pub noise: bool,
 }
 
+/// The configuration's value of `augment`.
 #[derive(Serialize, Deserialize)]
 #[serde(
     untagged,
-    expecting = "augment must be true, false or a list of \"flip\", \"transpose\", \"rgb\", \"exposure\", \"axes\", \"crop\" and \"noise\""
+    expecting = "augment must be a list such as [\"flip\", \"transpose\"]; its names are \"flip\", \"transpose\", \"rgb\", \"exposure\", \"axes\", \"crop\" and \"noise\""
 )]
-enum Setting {
-    All(bool),
-    Some(Vec<Kind>),
+enum AugmentList {
+    Names(Vec<Augmentation>),
 }
 
 #[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-enum Kind {
+enum Augmentation {
     Flip,
     Transpose,
     Rgb,
@@ -70,88 +74,79 @@ enum Kind {
     Noise,
 }
 
-const KINDS: [Kind; 7] = [
-    Kind::Flip,
-    Kind::Transpose,
-    Kind::Rgb,
-    Kind::Exposure,
-    Kind::Axes,
-    Kind::Crop,
-    Kind::Noise,
-];
-
 impl Augment {
-    fn has(self, kind: Kind) -> bool {
-        match kind {
-            Kind::Flip => self.flip,
-            Kind::Transpose => self.transpose,
-            Kind::Rgb => self.rgb,
-            Kind::Exposure => self.exposure,
-            Kind::Axes => self.axes,
-            Kind::Crop => self.crop,
-            Kind::Noise => self.noise,
-        }
-    }
+    /// All augmentations.
+    pub const ALL: Self = Self {
+        flip: true,
+        transpose: true,
+        rgb: true,
+        exposure: true,
+        axes: true,
+        crop: true,
+        noise: true,
+    };
 
-    fn of(kinds: &[Kind]) -> Self {
+    fn pairs(self) -> [(Augmentation, bool); 7] {
+        [
+            (Augmentation::Flip, self.flip),
+            (Augmentation::Transpose, self.transpose),
+            (Augmentation::Rgb, self.rgb),
+            (Augmentation::Exposure, self.exposure),
+            (Augmentation::Axes, self.axes),
+            (Augmentation::Crop, self.crop),
+            (Augmentation::Noise, self.noise),
+        ]
+    }
+}
+
+impl From<AugmentList> for Augment {
+    fn from(AugmentList::Names(names): AugmentList) -> Self {
+        let has = |name| names.contains(&name);
         Self {
-            flip: kinds.contains(&Kind::Flip),
-            transpose: kinds.contains(&Kind::Transpose),
-            rgb: kinds.contains(&Kind::Rgb),
-            exposure: kinds.contains(&Kind::Exposure),
-            axes: kinds.contains(&Kind::Axes),
-            crop: kinds.contains(&Kind::Crop),
-            noise: kinds.contains(&Kind::Noise),
+            flip: has(Augmentation::Flip),
+            transpose: has(Augmentation::Transpose),
+            rgb: has(Augmentation::Rgb),
+            exposure: has(Augmentation::Exposure),
+            axes: has(Augmentation::Axes),
+            crop: has(Augmentation::Crop),
+            noise: has(Augmentation::Noise),
         }
     }
 }
 
-impl From<Setting> for Augment {
-    fn from(setting: Setting) -> Self {
-        match setting {
-            Setting::All(true) => Self::of(&KINDS),
-            Setting::All(false) => Self::default(),
-            Setting::Some(kinds) => Self::of(&kinds),
-        }
-    }
-}
-
-impl From<Augment> for Setting {
+impl From<Augment> for AugmentList {
     fn from(augment: Augment) -> Self {
-        let kinds = KINDS.into_iter().filter(|kind| augment.has(*kind));
-        match kinds.collect::<Vec<_>>() {
-            none if none.is_empty() => Setting::All(false),
-            all if all.len() == KINDS.len() => Setting::All(true),
-            some => Setting::Some(some),
-        }
+        let enabled = augment.pairs().into_iter().filter(|(_, on)| *on);
+        Self::Names(enabled.map(|(name, _)| name).collect())
     }
 }
 
-/// What was drawn for one patch.
+/// The random changes drawn for one patch.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Variation {
-    /// Where the patch is cut, if not on the grid: from top to bottom and from left to right, 0 to below 1.
+    /// Position of the patch in its scene, if it is not on the grid: vertical and horizontal, from
+    /// 0 to below 1.
     crop: Option<[f64; 2]>,
     flip_x: bool,
     flip_y: bool,
     transpose: bool,
-    /// Which channel of the image becomes red, green and blue.
+    /// The channels of the image that become red, green and blue.
     pub rgb: [usize; 3],
     /// Factor on colour and reference.
     pub exposure: f32,
-    /// Which axis of the world becomes x, y and z.
+    /// The world axes that become x, y and z.
     pub axes: [usize; 3],
-    /// Which of x, y and z then point the other way.
+    /// Which of x, y and z are then mirrored.
     pub mirrored: [bool; 3],
-    /// What other noise is drawn from, if it is another one.
+    /// Seed of the new noise, if the noise is replaced.
     pub noise: Option<u64>,
 }
 
 impl Augment {
-    /// What is changed about the patch at `position` of `epoch`.
+    /// Draws the changes to the patch at `position` of `epoch`.
     pub fn draw(self, seed: u64, epoch: u64, position: u64) -> Variation {
-        let mut rng = generator(Use::Augment, seed, epoch, position);
-        // All are drawn, whatever is on: switching one off leaves the others as they were.
+        let mut rng = generator(RandomStream::Augment, seed, epoch, position);
+        // Everything is drawn in any case: disabling one augmentation does not change the others.
         let bits = rng.next_u32();
         let order = ORDERS[rng.random_range(0..ORDERS.len())];
         let stops = rng.random_range(-EXPOSURE_STOPS..EXPOSURE_STOPS);
@@ -174,7 +169,8 @@ impl Augment {
 }
 
 impl Variation {
-    /// Where `patch` of `size` is cut in its scene of `height` and `width`, which it fits into.
+    /// Position of `patch` of `size` in a scene of `height` and `width`, which must be large
+    /// enough.
     pub fn place(self, patch: Patch, (height, width): (usize, usize), size: usize) -> Patch {
         let origin = |side: usize, share: f64| ((side - size + 1) as f64 * share) as u32;
         match self.crop {
@@ -187,7 +183,7 @@ impl Variation {
         }
     }
 
-    /// Turns square planes in place.
+    /// Flips and transposes square planes in place.
     ///
     /// # Shapes
     /// `planes` is `[N, size, size]`.
@@ -289,11 +285,11 @@ mod tests {
 
     #[test]
     fn every_order_of_rgb_and_the_whole_range_of_exposures_are_drawn() {
-        let all = Augment::of(&KINDS);
+        let all = Augment::ALL;
         let drawn: Vec<Variation> = (0..300).map(|position| all.draw(1, 2, position)).collect();
         for order in ORDERS {
             let count = drawn.iter().filter(|v| v.rgb == order).count();
-            // 50 expected, deviation 6.5.
+            // 50 expected, standard deviation 6.5.
             assert!((20..80).contains(&count), "{order:?}: {count}");
         }
         let exposures = drawn.iter().map(|v| v.exposure);
@@ -304,8 +300,11 @@ mod tests {
     }
 
     #[test]
-    fn every_way_to_tell_the_axes_is_drawn() {
-        let axes = Augment::of(&[Kind::Axes]);
+    fn every_axis_permutation_and_mirroring_is_drawn() {
+        let axes = Augment {
+            axes: true,
+            ..Augment::default()
+        };
         let drawn: Vec<_> = (0..2400)
             .map(|position| axes.draw(1, 2, position))
             .map(|v| (v.axes, v.mirrored))
@@ -314,13 +313,14 @@ mod tests {
             for bits in 0..8 {
                 let mirrored = [0, 1, 2].map(|axis| bits >> axis & 1 != 0);
                 let count = drawn.iter().filter(|v| **v == (order, mirrored)).count();
-                // 50 expected, deviation 7.
+                // 50 expected, standard deviation 7.
                 assert!((20..85).contains(&count), "{order:?} {mirrored:?}: {count}");
             }
         }
     }
 
-    /// A patch of 32 in a scene of 36 x 34 has five rows and three columns to begin in.
+    /// A patch of 32 pixels in a scene of 36 x 34 has five possible rows and three possible
+    /// columns.
     #[test]
     fn crops_are_everywhere_in_the_scene_and_in_it() {
         let patch = Patch {
@@ -328,22 +328,25 @@ mod tests {
             y: 4,
             x: 2,
         };
-        let crop = Augment::of(&[Kind::Crop]);
+        let crop = Augment {
+            crop: true,
+            ..Augment::default()
+        };
         let mut counts = [[0; 3]; 5];
         for position in 0..1500 {
             let placed = crop.draw(1, 0, position).place(patch, (36, 34), 32);
             counts[placed.y as usize][placed.x as usize] += 1;
         }
-        // 100 expected each, deviation 10.
+        // 100 expected each, standard deviation 10.
         let all = counts.iter().flatten();
         assert!(all.clone().all(|n| (60..140).contains(n)), "{counts:?}");
         assert_eq!(NONE.place(patch, (36, 34), 32), patch);
     }
 
-    /// What else is on does not change what one augmentation draws.
+    /// Enabling other augmentations does not change the draws of one augmentation.
     #[test]
     fn augmentations_are_independent_of_each_other() {
-        let all = Augment::of(&KINDS);
+        let all = Augment::ALL;
         for position in 0..50 {
             let (both, turns) = (all.draw(7, 0, position), TURNS.draw(7, 0, position));
             assert_eq!(turned(both), turned(turns));
@@ -351,39 +354,57 @@ mod tests {
     }
 
     #[test]
-    fn settings_read_as_written_and_name_what_is_allowed() {
+    fn augment_lists_survive_toml_and_errors_name_the_choices() {
         #[derive(Debug, PartialEq, Serialize, Deserialize)]
-        struct Table {
+        struct DataTable {
             augment: Augment,
         }
-        let only = |kinds: &[Kind]| Augment::of(kinds);
+        let none = Augment::default();
         for (text, expected) in [
-            ("augment = true", only(&KINDS)),
-            ("augment = false", Augment::default()),
-            ("augment = [\"flip\"]", only(&[Kind::Flip])),
+            ("augment = []", none),
+            ("augment = [\"flip\"]", Augment { flip: true, ..none }),
             ("augment = [\"transpose\", \"flip\"]", TURNS),
-            ("augment = [\"rgb\"]", only(&[Kind::Rgb])),
+            ("augment = [\"rgb\"]", Augment { rgb: true, ..none }),
             (
                 "augment = [\"exposure\", \"rgb\"]",
-                only(&[Kind::Rgb, Kind::Exposure]),
+                Augment {
+                    rgb: true,
+                    exposure: true,
+                    ..none
+                },
             ),
             (
                 "augment = [\"noise\", \"crop\"]",
-                only(&[Kind::Crop, Kind::Noise]),
+                Augment {
+                    crop: true,
+                    noise: true,
+                    ..none
+                },
             ),
-            ("augment = []", Augment::default()),
+            (
+                "augment = [\"flip\", \"transpose\", \"rgb\", \"exposure\", \"axes\", \"crop\", \"noise\"]",
+                Augment::ALL,
+            ),
         ] {
-            let table: Table = toml::from_str(text).expect(text);
+            let table: DataTable = toml::from_str(text).expect(text);
             assert_eq!(table.augment, expected, "{text}");
             let written = toml::to_string(&table).expect("plain data");
-            assert_eq!(toml::from_str::<Table>(&written).expect("its own"), table);
+            assert_eq!(
+                toml::from_str::<DataTable>(&written).expect("its own"),
+                table
+            );
         }
-        let error = toml::from_str::<Table>("augment = [\"rotate\"]").expect_err("unknown");
-        assert!(
-            error.message().contains(
-                "a list of \"flip\", \"transpose\", \"rgb\", \"exposure\", \"axes\", \"crop\" and \"noise\""
-            ),
-            "{error}"
-        );
+        for text in [
+            "augment = true",
+            "augment = false",
+            "augment = [\"rotate\"]",
+        ] {
+            let error = toml::from_str::<DataTable>(text).expect_err("not a list of names");
+            assert_eq!(
+                error.message(),
+                "augment must be a list such as [\"flip\", \"transpose\"]; its names are \"flip\", \
+                 \"transpose\", \"rgb\", \"exposure\", \"axes\", \"crop\" and \"noise\""
+            );
+        }
     }
 }

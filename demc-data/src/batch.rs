@@ -1,11 +1,12 @@
-//! Batches of training patches. The patch stream is epoch 0, epoch 1, ... end to end, each epoch a seeded
-//! permutation of all patches; batch n is patches `n B .. (n + 1) B` of it. So a batch depends on the
-//! configuration, the seed and n only, and a resumed run goes on where it stopped.
+//! Batches of training patches. The patch stream concatenates epochs 0, 1, ...; each epoch is a
+//! seeded permutation of all patches. Batch n holds patches `n B .. (n + 1) B` of the stream. It
+//! depends only on the configuration, the seed and n, so a resumed run continues with the same
+//! batches.
 
 use crate::augment::{Augment, Variation};
-use crate::cache::{CacheUse, SceneCache};
+use crate::cache::{CacheUsage, SceneCache};
 use crate::frame::{FEATURES, FramePlanes, TEXTURES};
-use crate::patch::{Patch, epoch_order, patches};
+use crate::patch::{EpochOrders, Patch, patches};
 use crate::plane::Plane;
 use crate::resample::resample_noise;
 use crate::{ChannelLayout, DataConfig, Error, Normalizer, Scene};
@@ -13,24 +14,27 @@ use crate::{ChannelLayout, DataConfig, Error, Normalizer, Scene};
 /// Patches in the network's input space, with their references. B patches of P x P pixels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Batch {
-    /// B.
+    /// Number of patches, B.
     pub size: usize,
+    /// Side of a patch in pixels, P.
+    pub patch_size: usize,
     /// Noisy colour `[B, 3, P, P]`, gamma space, divided by the modulation.
     pub color_gamma: Vec<f32>,
     /// Features `[B, 12, P, P]`, Z-scored.
     pub features_z: Vec<f32>,
-    /// What the network's output is multiplied by, `[B, 3, P, P]`, gamma space ([`Normalizer::modulation`]).
+    /// Factor on the network's output, `[B, 3, P, P]`, gamma space ([`Normalizer::modulation`]).
     pub modulation: Option<Vec<f32>>,
     /// Reference colour `[B, 3, P, P]`, linear HDR.
     pub reference_hdr: Vec<f32>,
-    /// Where each patch was cut, before it was turned.
+    /// Position of each patch, before flips and transposes.
     pub patches: Vec<Patch>,
 }
 
-/// Makes any batch of a training run, from any thread.
+/// Computes any batch of a training run, on any thread.
 pub struct PatchSource {
     cache: SceneCache,
     patches: Vec<Patch>,
+    epoch_orders: EpochOrders,
     normalizer: Normalizer,
     patch_size: usize,
     batch_size: usize,
@@ -39,15 +43,15 @@ pub struct PatchSource {
     seed: u64,
 }
 
-/// One place in the patch stream.
-struct Draw {
+/// One patch of the stream, with its augmentation.
+struct PatchDraw {
     patch: Patch,
     variation: Variation,
 }
 
-/// One patch's share of a batch's buffers.
-struct Place<'a> {
-    draw: Draw,
+/// One patch and its part of the batch's buffers.
+struct PatchBuffers<'a> {
+    draw: PatchDraw,
     color: &'a mut [f32],
     features: &'a mut [f32],
     reference: &'a mut [f32],
@@ -55,14 +59,14 @@ struct Place<'a> {
 }
 
 impl PatchSource {
-    /// A source over the training `scenes`, which have a reference each. `normalizer` holds their statistics;
-    /// `config` must be valid.
+    /// A source over the training `scenes`, which need a reference each. `normalizer` holds their
+    /// statistics; `config` must be valid.
     ///
     /// # Errors
     /// [`Error::SceneTooSmall`]; [`Error::Layout`] if `layout` names no reference.
     ///
     /// # Panics
-    /// If there are no scenes: [`crate::Dataset::split`] never returns none.
+    /// If there are no scenes; [`crate::Dataset::split`] always returns at least one.
     pub fn new(
         config: &DataConfig,
         scenes: Vec<Scene>,
@@ -80,8 +84,8 @@ impl PatchSource {
         assert!(!scenes.is_empty(), "training needs at least one scene");
         let patches = patches(&scenes, config.patch_size, config.stride, config.border)?;
         Ok(Self {
-            cache: SceneCache::new(scenes, layout, config.cache_mib.saturating_mul(1 << 20))
-                .with_reference_filter(config.reference_filter),
+            cache: SceneCache::new(scenes, layout, config.cache_mib.saturating_mul(1 << 20)),
+            epoch_orders: EpochOrders::new(patches.len(), seed),
             patches,
             normalizer,
             patch_size: config.patch_size,
@@ -97,34 +101,37 @@ impl PatchSource {
         &self.patches
     }
 
-    /// The scenes that [`Patch::scene`] counts.
+    /// The scenes that [`Patch::scene`] refers to.
     pub fn scenes(&self) -> &[Scene] {
         self.cache.scenes()
     }
 
-    /// How many threads a loader should run.
+    /// Number of threads that a loader should run.
     pub fn workers(&self) -> usize {
         self.workers
     }
 
-    /// What the scene cache holds.
-    pub fn cache_usage(&self) -> CacheUse {
+    /// Usage of the scene cache.
+    pub fn cache_usage(&self) -> CacheUsage {
         self.cache.usage()
     }
 
     /// Batch `n` of the run.
     ///
     /// # Errors
-    /// As [`SceneCache::get`], for a scene that it needs.
+    /// As [`SceneCache::get`], for any scene of the batch.
     pub fn batch(&self, n: u64) -> Result<Batch, Error> {
         let draws = self.draws(n);
         let pixels = self.patch_size * self.patch_size;
         let mut batch = Batch {
             size: draws.len(),
+            patch_size: self.patch_size,
             color_gamma: vec![0.0; draws.len() * 3 * pixels],
             features_z: vec![0.0; draws.len() * FEATURES * pixels],
-            modulation: (self.normalizer.demodulate > 0.0)
-                .then(|| vec![0.0; draws.len() * 3 * pixels]),
+            modulation: self
+                .normalizer
+                .albedo_demodulation_epsilon
+                .map(|_| vec![0.0; draws.len() * 3 * pixels]),
             reference_hdr: vec![0.0; draws.len() * 3 * pixels],
             patches: draws.iter().map(|draw| draw.patch).collect(),
         };
@@ -133,10 +140,10 @@ impl PatchSource {
         let reference = batch.reference_hdr.chunks_exact_mut(3 * pixels);
         let modulation = batch.modulation.iter_mut();
         let mut modulation = modulation.flat_map(|all| all.chunks_exact_mut(3 * pixels));
-        let mut places: Vec<Place> = draws
+        let mut places: Vec<PatchBuffers> = draws
             .into_iter()
             .zip(color.zip(features.zip(reference)))
-            .map(|(draw, (color, (features, reference)))| Place {
+            .map(|(draw, (color, (features, reference)))| PatchBuffers {
                 draw,
                 color,
                 features,
@@ -144,7 +151,7 @@ impl PatchSource {
                 modulation: modulation.next(),
             })
             .collect();
-        // Scene by scene: with a cache smaller than the data, each scene is decoded once a batch.
+        // Scene by scene: with a cache smaller than the data, each scene is decoded once per batch.
         places.sort_by_key(|place| place.draw.patch.scene);
         for places in places.chunk_by_mut(|a, b| a.draw.patch.scene == b.draw.patch.scene) {
             let planes = self.cache.get(places[0].draw.patch.scene as usize)?;
@@ -155,14 +162,14 @@ impl PatchSource {
         Ok(batch)
     }
 
-    /// Where batch `n` is cut, in the order of the stream.
-    fn draws(&self, n: u64) -> Vec<Draw> {
+    /// The patches of batch `n`, in stream order.
+    fn draws(&self, n: u64) -> Vec<PatchDraw> {
         let count = self.patches.len() as u64;
         let mut epoch = n * self.batch_size as u64 / count;
         let mut position = n * self.batch_size as u64 % count;
         let mut draws = Vec::with_capacity(self.batch_size);
         while draws.len() < self.batch_size {
-            let order = epoch_order(self.patches.len(), self.seed, epoch);
+            let order = self.epoch_orders.get(epoch);
             for &index in order
                 .iter()
                 .skip(position as usize)
@@ -171,7 +178,7 @@ impl PatchSource {
                 let variation = self.augment.draw(self.seed, epoch, position);
                 let patch = self.patches[index as usize];
                 let scene = &self.cache.scenes()[patch.scene as usize];
-                draws.push(Draw {
+                draws.push(PatchDraw {
                     patch: variation.place(patch, (scene.height, scene.width), self.patch_size),
                     variation,
                 });
@@ -182,8 +189,8 @@ impl PatchSource {
         draws
     }
 
-    /// Cuts one patch, varies it and takes it to the network's space.
-    fn cut(&self, from: &FramePlanes, place: &mut Place<'_>) {
+    /// Cuts one patch, augments it and converts it to the network's input space.
+    fn cut(&self, from: &FramePlanes, place: &mut PatchBuffers<'_>) {
         let reference = from.reference.as_ref().expect("it is read as required");
         let (patch, size) = (place.draw.patch, self.patch_size);
         let variation = place.draw.variation;
@@ -216,12 +223,13 @@ impl PatchSource {
     }
 }
 
-/// Which planes become the channels `order`, of three that begin at `first`.
+/// Indices of the planes that become the channels `order`, out of three starting at `first`.
 fn three(first: usize, order: [usize; 3]) -> [usize; 3] {
     order.map(|channel| first + channel)
 }
 
-/// Which planes become the features: normals and positions in the order of the axes, textures in that of red, green and blue.
+/// Indices of the planes that become the features. Normals and positions follow the order of axes;
+/// textures follow the order of red, green and blue.
 fn feature_order(variation: Variation) -> Vec<usize> {
     let Variation { axes, rgb, .. } = variation;
     let orders = [(0, axes), (3, axes), (TEXTURES, rgb), (TEXTURES + 3, rgb)];
@@ -231,7 +239,7 @@ fn feature_order(variation: Variation) -> Vec<usize> {
         .collect()
 }
 
-/// Turns axes of normals and positions round.
+/// Mirrors axes of normals and positions.
 fn mirror(features: &mut [f32], mirrored: [bool; 3], pixels: usize) {
     let vectors = features[..TEXTURES * pixels].chunks_exact_mut(pixels);
     for (plane, mirrored) in vectors.zip(mirrored.into_iter().cycle()) {

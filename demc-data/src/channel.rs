@@ -1,4 +1,4 @@
-//! What a file's header says of each channel.
+//! Channels as described by a file's header.
 
 use std::fmt;
 
@@ -7,12 +7,12 @@ use serde::Serialize;
 /// One channel of a file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Channel {
-    /// Its name, as a layout has to spell it: `Layer.channel` in a file of several parts. What is no UTF-8, and control
-    /// characters, are U+FFFD.
+    /// Its name, as spelled in a layout: `Layer.channel` in a file of several parts. Invalid UTF-8
+    /// and control characters become U+FFFD.
     pub name: String,
     /// The type of its samples.
-    pub kind: Kind,
-    /// The name of the part it is in, where the part has one.
+    pub kind: ChannelType,
+    /// The name of its part, if the part has one.
     pub layer: Option<String>,
     /// The pixels that it covers.
     pub window: Window,
@@ -25,7 +25,7 @@ pub struct Channel {
 /// A sample type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Kind {
+pub enum ChannelType {
     /// 16-bit floating point.
     Half,
     /// 32-bit floating point.
@@ -34,12 +34,12 @@ pub enum Kind {
     Uint,
 }
 
-impl fmt::Display for Kind {
+impl fmt::Display for ChannelType {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.pad(match self {
-            Kind::Half => "half",
-            Kind::Float => "float",
-            Kind::Uint => "uint",
+            ChannelType::Half => "half",
+            ChannelType::Float => "float",
+            ChannelType::Uint => "uint",
         })
     }
 }
@@ -58,7 +58,7 @@ pub struct Window {
 }
 
 impl fmt::Display for Window {
-    /// `WxH`, or `WxH+X+Y` where the window does not start at the origin.
+    /// `WxH`, or `WxH+X+Y` if the window does not start at the origin.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}x{}", self.width, self.height)?;
         match (self.x, self.y) {
@@ -68,7 +68,8 @@ impl fmt::Display for Window {
     }
 }
 
-/// `Layer.channel`; a channel that already carries its layer's name (as some writers do) keeps its own.
+/// `Layer.channel`. A channel that already starts with its layer's name, as some writers do it,
+/// keeps its name.
 pub(crate) fn full_name(layer: Option<&str>, channel: &str) -> String {
     match layer {
         Some(layer) if !layer.is_empty() && !channel.starts_with(&format!("{layer}.")) => {

@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 use crate::augment::Augment;
 use crate::patch::Border;
 
-/// The committed sample: every configuration starts on it without an edit.
+/// The committed sample data, so that every configuration runs without an edit.
 const ROOT: &str = "data/sample";
-/// This project's own files.
+/// The layout of this project's own files.
 const LAYOUT: &str = "demc-exr";
 /// "We set patch size as 128 x 128" (Sec. 4.2).
 const PATCH_SIZE: usize = 128;
@@ -19,37 +19,36 @@ const STRIDE: usize = 80;
 const BORDER: Border = Border::Shift;
 /// Eq. 4.
 const GAMMA: f32 = 2.2;
-/// The paper's network sees colour as it is.
-const DEMODULATE: f32 = 0.0;
-/// Where it is not 0: less would let black textures blow colour up, more than a white texture has is a mistake.
-const DEMODULATIONS: std::ops::RangeInclusive<f32> = 1e-3..=1.0;
 /// Ours: the paper gives none; 64 fits its schedule, time and memory.
 const BATCH_SIZE: usize = 64;
-/// Ours: a tenth of the training split's base scenes.
+/// Ours: a tenth of the base scenes of the training split.
 const VALIDATION: f64 = 0.1;
 /// Ours: holds the paper's 97 scenes of 1280x720 (3.8 GB) and leaves half of 8 GiB.
 const CACHE_MIB: usize = 4096;
-/// Ours: one thread keeps ahead of training on a CPU.
+/// Ours: one thread is fast enough for training on a CPU.
 const WORKERS: usize = 1;
 
-/// Below 1, `y^gamma` has an infinite slope at black, and so has the loss; more than 6 is a mistake.
+/// A smaller epsilon amplifies the colour of black surfaces; a larger one exceeds the albedo of
+/// white.
+const ALBEDO_EPSILONS: std::ops::RangeInclusive<f32> = 1e-3..=1.0;
+/// Below 1, `y^gamma` and the loss have an infinite slope at black; a value above 6 is a mistake.
 const GAMMAS: std::ops::RangeInclusive<f32> = 1.0..=6.0;
-/// The network halves its input five times: patches are multiples of this (Fig. 3).
+/// The network halves its input five times, so patch sizes are multiples of this (Fig. 3).
 const PATCH_MULTIPLE: usize = 32;
 /// A longer side is a mistake: the paper's scenes are 1280x720.
 const MAX_PATCH_SIZE: usize = 4096;
 /// More patches than this are a mistake: at the paper's patch size their features are 52 GB.
 const MAX_BATCH_SIZE: usize = 65536;
-/// 16 TiB: more is a mistake, and in bytes it could be too large for a `usize`.
+/// 16 TiB. A larger value is a mistake and could overflow a `usize` in bytes.
 const MAX_CACHE_MIB: usize = 1 << 24;
 /// More threads than this are a mistake.
 const MAX_WORKERS: usize = 64;
 
-/// Where the training data is and how it is cut up.
+/// The training data and its division into patches and batches.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DataConfig {
-    /// Directory of the data set (with `manifest.json`); a relative path starts at the current directory.
+    /// Directory of the data set (with `manifest.json`); relative to the current directory.
     pub root: PathBuf,
     /// Channel layout: a preset or a TOML file ([`crate::ChannelLayout::resolve`]).
     pub layout: String,
@@ -57,24 +56,24 @@ pub struct DataConfig {
     pub patch_size: usize,
     /// Distance between patches in pixels.
     pub stride: usize,
-    /// `"shift"`: a last row and column of patches at the edge; `"drop"`: none.
+    /// `"shift"`: adds a last row and column of patches at the edge; `"drop"`: adds none.
     pub border: Border,
     /// The transfer function's exponent is `1 / gamma` (Eq. 4); from 1 to 6.
     pub gamma: f32,
-    /// What is added to the first texture where colour is divided by it before the network, and its output multiplied by it
-    /// ([`crate::Normalizer::modulation`]), from 0.001 to 1; 0: colour is not divided.
-    pub demodulate: f32,
+    /// Albedo demodulation divides the input colour by (albedo + epsilon) and multiplies the output
+    /// by it ([`crate::Normalizer::modulation`]). From 0.001 to 1; absent: off, as in the paper.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub albedo_demodulation_epsilon: Option<f32>,
     /// Patches in a batch, at most 65536.
     pub batch_size: usize,
-    /// Share of the training split's base scenes that is held out for validation, 0 to below 1.
+    /// Share of the training split's base scenes held out for validation, from 0 to below 1.
     pub validation: f64,
-    /// Augmentation: `true` (all), `false` or a list of `"flip"`, `"transpose"`, `"rgb"`, `"exposure"`, `"axes"`, `"crop"` and `"noise"`.
+    /// Augmentations: a list of `"flip"`, `"transpose"`, `"rgb"`, `"exposure"`, `"axes"`, `"crop"`
+    /// and `"noise"`; empty: none, as in the paper.
     pub augment: Augment,
-    /// Filter the training scenes' references ([`crate::reference_filter`]), but those that are denoised already: for references with visible noise.
-    pub reference_filter: bool,
     /// Memory for decoded scenes, in MiB, at most 2^24.
     pub cache_mib: usize,
-    /// Threads that decode and cut batches; the batches do not depend on it.
+    /// Threads that decode scenes and cut patches; the batches do not depend on their number.
     pub workers: usize,
 }
 
@@ -88,11 +87,10 @@ impl Default for DataConfig {
             stride: STRIDE,
             border: BORDER,
             gamma: GAMMA,
-            demodulate: DEMODULATE,
+            albedo_demodulation_epsilon: None,
             batch_size: BATCH_SIZE,
             validation: VALIDATION,
             augment: Augment::default(),
-            reference_filter: false,
             cache_mib: CACHE_MIB,
             workers: WORKERS,
         }
@@ -100,7 +98,7 @@ impl Default for DataConfig {
 }
 
 impl DataConfig {
-    /// Every value that is out of range, as `key = value: what is allowed`; empty if all are well.
+    /// Every value out of range, as `data.key = value: must be ...`; empty if all values are valid.
     pub fn validate(&self) -> Vec<String> {
         let mut problems = Vec::new();
         let mut require = |holds: bool, key: &str, value: &dyn std::fmt::Debug, allowed: &str| {
@@ -122,12 +120,14 @@ impl DataConfig {
             &self.gamma,
             "from 1 to 6",
         );
-        require(
-            self.demodulate == 0.0 || DEMODULATIONS.contains(&self.demodulate),
-            "demodulate",
-            &self.demodulate,
-            "0, or from 0.001 to 1",
-        );
+        if let Some(epsilon) = self.albedo_demodulation_epsilon {
+            require(
+                ALBEDO_EPSILONS.contains(&epsilon),
+                "albedo_demodulation_epsilon",
+                &epsilon,
+                "from 0.001 to 1; remove the key to switch demodulation off",
+            );
+        }
         require(
             (1..=MAX_BATCH_SIZE).contains(&self.batch_size),
             "batch_size",
@@ -182,7 +182,7 @@ mod tests {
             patch_size: 100,
             stride: 0,
             gamma: f32::NAN,
-            demodulate: 1e-9,
+            albedo_demodulation_epsilon: Some(1e-9),
             batch_size: 0,
             validation: 1.0,
             workers: 0,
@@ -203,7 +203,7 @@ mod tests {
             batch_size: MAX_BATCH_SIZE + more,
             cache_mib: MAX_CACHE_MIB + more,
             gamma: 6.0 + more as f32,
-            demodulate: 1.0 + more as f32,
+            albedo_demodulation_epsilon: Some(1.0 + more as f32),
             ..DataConfig::default()
         };
         assert_eq!(sized(0).validate(), Vec::<String>::new());
@@ -214,9 +214,11 @@ mod tests {
     #[test]
     fn unknown_keys_are_refused_and_known_ones_survive() {
         assert!(toml::from_str::<DataConfig>("patchsize = 64").is_err());
-        let text = "root = \"x\"\nborder = \"drop\"\naugment = [\"flip\"]\nvalidation = 0.0";
+        assert!(toml::from_str::<DataConfig>("demodulate = 0.07").is_err());
+        let text = "albedo_demodulation_epsilon = 0.07\nroot = \"x\"\nborder = \"drop\"\naugment = [\"flip\"]\nvalidation = 0.0";
         let config: DataConfig = toml::from_str(text).expect("known keys");
         assert_eq!(config.border, Border::Drop);
+        assert_eq!(config.albedo_demodulation_epsilon, Some(0.07));
         let written = toml::to_string(&config).expect("plain data");
         assert_eq!(
             toml::from_str::<DataConfig>(&written).expect("its own"),

@@ -1,5 +1,5 @@
-//! A data set on disk: its `manifest.json`, its scenes and how they are split. Scenes are split by *base
-//! scene*: views of one room may never be on both sides.
+//! A data set on disk: its `manifest.json`, its scenes and its splits. Scenes are split by *base
+//! scene*: views of one room are never in both splits.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::fmt;
@@ -10,15 +10,15 @@ use serde::{Deserialize, Serialize};
 
 use crate::channel::Window;
 use crate::frame::{Presence, check_header};
-use crate::seed::{Use, generator};
+use crate::seed::{RandomStream, generator};
 use crate::{ChannelLayout, Error};
 
 /// The manifest format that this version reads.
 const FORMAT: &str = "demc-exr 1";
-/// Problems listed in one message; the rest is counted.
+/// Maximum number of problems in one message; the others are counted.
 const PROBLEMS_LISTED: usize = 8;
 
-/// Which part of a data set a scene belongs to.
+/// The part of a data set that a scene belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
@@ -37,7 +37,7 @@ impl fmt::Display for Split {
     }
 }
 
-/// One image of a data set, as the manifest describes it.
+/// One image of a data set, as described by the manifest.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
     /// Its name, unique in the data set.
@@ -52,11 +52,10 @@ pub struct Scene {
     pub width: usize,
     /// Height in pixels.
     pub height: usize,
-    /// Expected RelMSE of the reference against a perfect one, where it is known.
+    /// Expected RelMSE of the reference against a perfect one, if known.
     pub ref_residual_relmse: Option<f64>,
-    /// What has denoised the reference, where something has: [`crate::reference_filter`] leaves it as it is.
-    pub ref_denoised: Option<String>,
-    /// The other keys of its manifest entry: licences, credits, render settings.
+    /// The other keys of its manifest entry: licences, credits, render
+    /// settings, the denoiser of the reference.
     pub other: serde_json::Map<String, serde_json::Value>,
 }
 
@@ -69,19 +68,19 @@ pub struct Dataset {
     pub scenes: Vec<Scene>,
 }
 
-/// What any version of the format has.
+/// The key that all versions of the format have.
 #[derive(Deserialize)]
-struct Head {
+struct ManifestHeader {
     format: String,
 }
 
 #[derive(Deserialize)]
 struct Manifest {
-    scenes: Vec<Entry>,
+    scenes: Vec<ManifestScene>,
 }
 
 #[derive(Deserialize)]
-struct Entry {
+struct ManifestScene {
     name: String,
     split: Split,
     base: String,
@@ -89,26 +88,23 @@ struct Entry {
     width: usize,
     height: usize,
     ref_residual_relmse: Option<f64>,
-    ref_denoised: Option<String>,
     #[serde(flatten)]
     other: serde_json::Map<String, serde_json::Value>,
 }
 
 impl Dataset {
-    /// Opens `root/manifest.json` and checks that every scene's file is there, has the manifest's size, and
-    /// holds what `layout` names, the reference included. Decodes no pixels.
+    /// Opens `root/manifest.json` and checks every scene's file: it exists, has the size in the
+    /// manifest, and holds the channels of `layout`, including the reference. Decodes no pixels.
     ///
     /// # Errors
-    /// [`Error::Read`] without a manifest, otherwise [`Error::Dataset`] with every problem found.
+    /// [`Error::Read`] without a manifest, otherwise [`Error::Dataset`] with all problems.
     pub fn open(root: &Path, layout: &ChannelLayout) -> Result<Self, Error> {
         let path = root.join("manifest.json");
         let text = std::fs::read_to_string(&path).map_err(|source| Error::Read { path, source })?;
         let scenes = parse(root, &text).map_err(|problem| unusable(root, vec![problem]))?;
         let mut problems = manifest_problems(&scenes);
         if layout.reference.is_none() {
-            problems.push(
-                "the layout names no reference, and nothing can be learnt without one".to_owned(),
-            );
+            problems.push("the layout names no reference, which training needs".to_owned());
         }
         problems.extend(file_problems(&scenes, layout));
         match problems.is_empty() {
@@ -140,9 +136,9 @@ impl Dataset {
         }
     }
 
-    /// The training split, taken apart into scenes to train on and scenes to validate with: a `share` of its
-    /// *base* scenes (rounded, but one at least and not all) is held out, drawn by `seed`. A share of 0, or a
-    /// single base scene, leaves nothing to validate with.
+    /// Divides the training split into scenes for training and for validation. A `share` of its
+    /// *base* scenes is held out, drawn by `seed`: rounded, at least one, and not all. A share of
+    /// 0, or a single base scene, leaves no scenes for validation.
     ///
     /// # Errors
     /// [`Error::Dataset`] if the training split is empty.
@@ -153,9 +149,9 @@ impl Dataset {
     ) -> Result<(Vec<Scene>, Vec<Scene>), Error> {
         let scenes = self.split(Split::Train)?;
         let bases: BTreeSet<&str> = scenes.iter().map(|scene| scene.base.as_str()).collect();
-        // From a sorted list, so that the manifest's order does not matter.
+        // The list is sorted, so the order of the manifest does not matter.
         let mut bases: Vec<&str> = bases.into_iter().collect();
-        bases.shuffle(&mut generator(Use::Validation, seed, 0, 0));
+        bases.shuffle(&mut generator(RandomStream::Validation, seed, 0, 0));
         bases.truncate(held_out(share, bases.len()));
         let held: HashSet<String> = bases.into_iter().map(str::to_owned).collect();
         Ok(scenes
@@ -164,7 +160,7 @@ impl Dataset {
     }
 }
 
-/// How many of `bases` base scenes a `share` of them is.
+/// Number of base scenes that a `share` of `bases` is.
 fn held_out(share: f64, bases: usize) -> usize {
     if share <= 0.0 || bases < 2 {
         return 0;
@@ -174,7 +170,7 @@ fn held_out(share: f64, bases: usize) -> usize {
 
 fn parse(root: &Path, text: &str) -> Result<Vec<Scene>, String> {
     let problem = |error: serde_json::Error| format!("manifest.json: {error}");
-    let Head { format } = serde_json::from_str(text).map_err(problem)?;
+    let ManifestHeader { format } = serde_json::from_str(text).map_err(problem)?;
     match format.strip_prefix(FORMAT) {
         Some(minor) if !minor.starts_with(|c: char| c.is_ascii_digit()) => {}
         _ => {
@@ -184,7 +180,7 @@ fn parse(root: &Path, text: &str) -> Result<Vec<Scene>, String> {
         }
     }
     let Manifest { scenes } = serde_json::from_str(text).map_err(problem)?;
-    let scene = |entry: Entry| Scene {
+    let scene = |entry: ManifestScene| Scene {
         name: entry.name,
         split: entry.split,
         base: entry.base,
@@ -192,7 +188,6 @@ fn parse(root: &Path, text: &str) -> Result<Vec<Scene>, String> {
         width: entry.width,
         height: entry.height,
         ref_residual_relmse: entry.ref_residual_relmse,
-        ref_denoised: entry.ref_denoised,
         other: entry.other,
     };
     Ok(scenes.into_iter().map(scene).collect())
@@ -216,7 +211,8 @@ fn manifest_problems(scenes: &[Scene]) -> Vec<String> {
     problems
 }
 
-/// What is wrong with the scenes' files. Channels that many of them lack are one problem, named with the first.
+/// Problems with the scenes' files. If several files lack the same channels, that is one problem,
+/// named for the first file.
 fn file_problems(scenes: &[Scene], layout: &ChannelLayout) -> Vec<String> {
     let mut problems: Vec<(Error, usize)> = Vec::new();
     for error in scenes.iter().filter_map(|scene| file_error(scene, layout)) {
@@ -232,7 +228,7 @@ fn file_problems(scenes: &[Scene], layout: &ChannelLayout) -> Vec<String> {
     let phrase = |(error, more): &(Error, usize)| match (std::error::Error::source(error), more) {
         (Some(source), _) => format!("{error}: {source}"),
         (None, 0) => error.to_string(),
-        (None, more) => format!("{error} (and so in {more} more scenes)"),
+        (None, more) => format!("{error} (the same in {more} more scenes)"),
     };
     problems.iter().map(phrase).collect()
 }
@@ -251,7 +247,7 @@ fn file_error(scene: &Scene, layout: &ChannelLayout) -> Option<Error> {
     }
 }
 
-/// The error for a file whose size is not what the manifest says.
+/// The error for a file whose size differs from the manifest.
 pub(crate) fn size_mismatch(scene: &Scene, width: usize, height: usize) -> Option<Error> {
     let size = |width, height| {
         Window {

@@ -1,5 +1,5 @@
-//! What can go wrong with files, data sets and settings. Each message is one line that names the path,
-//! channel or key, what was expected and what was found; an underlying I/O error is the `source`.
+//! Errors of files, data sets and settings. Each message is one line that names the path, channel
+//! or key, the expectation and the finding. An underlying I/O error is the `source`.
 
 use std::path::PathBuf;
 
@@ -11,36 +11,36 @@ pub enum Error {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
-    /// An output could not be written; nothing was left behind.
+    /// An output could not be written; no partial file remains.
     #[error("cannot write {}", path.display())]
     Write {
         /// The output.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
-    /// Not an OpenEXR file, cut short, damaged, or of a kind that is not read (deep data, subsampling).
+    /// Not an OpenEXR file, truncated, damaged, or of an unsupported kind (deep data, subsampling).
     #[error("{}: not a readable OpenEXR file: {detail}", path.display())]
     Exr {
         /// The file.
         path: PathBuf,
-        /// What the decoder said.
+        /// The decoder's message.
         detail: String,
     },
-    /// Channels that the layout names are not in the file.
+    /// The file lacks channels that the layout names.
     #[error("{}: no channel {}; the file has {}", path.display(), missing.join(", "), present.join(", "))]
     MissingChannels {
         /// The file.
         path: PathBuf,
-        /// The channels asked for and not found.
+        /// The missing channels.
         missing: Vec<String>,
         /// All channels of the file.
         present: Vec<String>,
     },
-    /// Two buffers of one image do not cover the same pixels.
+    /// Two buffers of one image cover different pixels.
     #[error("{}: buffers of different sizes: {a} is {a_window}, {b} is {b_window}", path.display())]
     Sizes {
         /// The file.
@@ -54,7 +54,7 @@ pub enum Error {
         /// Its window.
         b_window: String,
     },
-    /// NaN or infinity in a buffer.
+    /// A buffer contains NaN or infinity.
     #[error(
         "{}: channel {channel}: {value} at x {x}, y {y} ({count} NaN or infinite samples in all)",
         path.display()
@@ -70,18 +70,18 @@ pub enum Error {
         x: usize,
         /// Its row, pixels from the top.
         y: usize,
-        /// How many samples of this channel are bad.
+        /// Number of bad samples in this channel.
         count: usize,
     },
-    /// A channel layout that cannot be used.
+    /// An unusable channel layout.
     #[error("channel layout {name}: {detail}")]
     Layout {
         /// The preset or file.
         name: String,
-        /// What is wrong with it.
+        /// The problem.
         detail: String,
     },
-    /// A data set that cannot be used; every problem found is named.
+    /// An unusable data set; the message names every problem.
     #[error("data set {}: {}", root.display(), problems.join("; "))]
     Dataset {
         /// The data set's directory.
@@ -89,17 +89,17 @@ pub enum Error {
         /// All problems, one phrase each.
         problems: Vec<String>,
     },
-    /// A scene file's size is not the manifest's.
+    /// A scene file whose size differs from the manifest.
     #[error("{}: is {found}, but the manifest says {expected}", path.display())]
     SceneSize {
         /// The file.
         path: PathBuf,
         /// The file's size, as `WxH`.
         found: String,
-        /// The manifest's.
+        /// The size in the manifest.
         expected: String,
     },
-    /// A scene too small to hold one patch.
+    /// A scene too small for one patch.
     #[error("scene {scene}: {width}x{height} pixels hold no patch of {patch}x{patch}")]
     SceneTooSmall {
         /// The scene's name.

@@ -1,4 +1,4 @@
-//! Output files that appear whole or not at all.
+//! Output files that are complete or absent.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
@@ -6,13 +6,13 @@ use std::path::{Path, PathBuf};
 
 use crate::Error;
 
-/// Writes `path` through `fill`: to a temporary name in the same directory, flushed to the disk, mode 0644,
-/// then renamed. Whoever looks at `path` sees the old file or the new one, never a part. A symbolic link
-/// stays: the file that it leads to is replaced.
+/// Writes `path` through `fill`: to a temporary name in the same directory, flushed to the disk,
+/// mode 0644, then renamed. Readers of `path` see either the old or the new file. A symbolic link
+/// stays, and its target is replaced.
 ///
 /// # Errors
-/// [`Error::Write`], naming `path`; the temporary file is removed. Its source is of the kind
-/// [`io::ErrorKind::InvalidInput`] if a device, a FIFO or a directory is in the way, which is left alone.
+/// [`Error::Write`], naming `path`; the temporary file is removed. If `path` is a device, a FIFO or
+/// a directory, the source has the kind [`io::ErrorKind::InvalidInput`], and nothing changes.
 pub fn write_whole(
     path: &Path,
     fill: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
@@ -24,7 +24,7 @@ pub fn write_whole(
     let target = target_of(path).map_err(error)?;
     let temporary = temporary_beside(&target).map_err(error)?;
     fill_and_rename(&temporary, &target, fill).map_err(|source| {
-        // The first error is the one to report: there may be nothing to remove.
+        // Reports the first error; the temporary file may not exist.
         let _ = fs::remove_file(&temporary);
         error(source)
     })
@@ -46,24 +46,24 @@ fn fill_and_rename(
     sync_dir(path.parent().unwrap_or(Path::new("")))
 }
 
-/// Brings the names in a directory to the disk: without that, a crash may undo a rename.
+/// Flushes the entries of a directory to the disk; without this, a crash may undo a rename.
 ///
 /// # Errors
-/// A directory that cannot be opened, or a disk that fails.
+/// If the directory cannot be opened, or the disk fails.
 pub fn sync_dir(dir: &Path) -> io::Result<()> {
-    // Elsewhere a directory cannot be opened like a file.
+    // Other systems cannot open a directory as a file.
     #[cfg(unix)]
     {
-        let here = dir.as_os_str().is_empty();
-        File::open(if here { Path::new(".") } else { dir })?.sync_all()?;
+        let is_current = dir.as_os_str().is_empty();
+        File::open(if is_current { Path::new(".") } else { dir })?.sync_all()?;
     }
     #[cfg(not(unix))]
     let _ = dir;
     Ok(())
 }
 
-/// The file that `path` stands for: itself, or what a symbolic link leads to. A rename would replace a link,
-/// a FIFO, or the device `/dev/null`, by a file.
+/// The file to replace: `path`, or the target of a symbolic link. A rename would replace a link, a
+/// FIFO, or the device `/dev/null` by a file.
 fn target_of(path: &Path) -> io::Result<PathBuf> {
     let refused = |why: &str| Err(io::Error::new(io::ErrorKind::InvalidInput, why));
     match fs::symlink_metadata(path) {
@@ -72,14 +72,14 @@ fn target_of(path: &Path) -> io::Result<PathBuf> {
     };
     match fs::canonicalize(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => {
-            refused("a symbolic link that leads nowhere")
+            refused("a symbolic link without a target")
         }
         Ok(target) if !fs::metadata(&target)?.is_file() => refused("not a regular file"),
         target => target,
     }
 }
 
-/// `DIR/.NAME.PID.tmp` for `DIR/NAME`: hidden, and two processes do not meet in it.
+/// `DIR/.NAME.PID.tmp` for `DIR/NAME`: hidden, and different for each process.
 fn temporary_beside(path: &Path) -> io::Result<PathBuf> {
     let name = path
         .file_name()

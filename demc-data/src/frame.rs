@@ -1,5 +1,6 @@
-//! One rendered image with its feature buffers, checked: all buffers cover the same pixels, nothing is NaN
-//! or infinite, no radiance is negative. [`FramePlanes`] keeps the file's precision, [`Frame`] is `f32`.
+//! A rendered image with its feature buffers, checked. All buffers cover the same pixels, no value
+//! is NaN or infinite, and no radiance is negative. [`FramePlanes`] keeps the file's precision;
+//! [`Frame`] is `f32`.
 
 use std::io::{Read, Seek};
 use std::path::Path;
@@ -11,11 +12,11 @@ use crate::layout::{ChannelLayout, Missing, Triple};
 use crate::parallel;
 use crate::plane::Plane;
 
-/// Number of feature channels: normal xyz, position xyz, texture RGB at the first and at the second vertex
-/// (Sec. 3.1).
+/// Number of feature channels: normal xyz, position xyz, texture RGB at the first and at the second
+/// vertex (Sec. 3.1).
 pub const FEATURES: usize = 12;
 
-/// The first of the texture channels; normals and positions lie before it.
+/// Index of the first texture channel; normals and positions come before it.
 pub const TEXTURES: usize = 6;
 
 /// The feature channels in the network's order.
@@ -47,24 +48,25 @@ pub struct Frame {
     pub color: Vec<f32>,
     /// Features `[12, H, W]` in the order of [`FEATURE_NAMES`], as rendered.
     pub features: Vec<f32>,
-    /// Reference colour `[3, H, W]`, where the layout names it and the file has it.
+    /// Reference colour `[3, H, W]`, if the layout names it and the file has it.
     pub reference: Option<Vec<f32>>,
-    /// Share of a pixel's camera rays that hit a surface `[H, W]`, where the layout names it and the file has it.
+    /// Share of a pixel's camera rays that hit a surface `[H, W]`, if the layout names it and the
+    /// file has it.
     pub mask: Option<Vec<f32>>,
-    /// How many negative samples of colour and reference were set to 0.
+    /// Number of negative samples of colour and reference that were set to 0.
     pub clamped: usize,
 }
 
-/// Reads and checks an image. The reference and the mask are read where they are there.
+/// Reads and checks an image. Reference and mask are read if present.
 ///
 /// # Errors
-/// [`Error::Read`] and [`Error::Exr`] for a file that cannot be decoded, [`Error::MissingChannels`],
-/// [`Error::Sizes`] and [`Error::NonFinite`] for buffers that cannot be used.
+/// [`Error::Read`] and [`Error::Exr`] for a file that cannot be decoded.
+/// [`Error::MissingChannels`], [`Error::Sizes`] and [`Error::NonFinite`] for unusable buffers.
 pub fn read_frame(path: &Path, layout: &ChannelLayout) -> Result<Frame, Error> {
-    decode(&mut ExrFile::open(path)?, layout, Presence::IfThere)
+    decode(&mut ExrFile::open(path)?, layout, Presence::IfPresent)
 }
 
-/// The same without the reference: what denoising needs.
+/// As [`read_frame`], without the reference: the input of denoising.
 ///
 /// # Errors
 /// As [`read_frame`].
@@ -72,7 +74,7 @@ pub fn read_input(path: &Path, layout: &ChannelLayout) -> Result<Frame, Error> {
     decode_input(&mut ExrFile::open(path)?, layout)
 }
 
-/// The same of a file that is open already.
+/// As [`read_input`], for an open file.
 ///
 /// # Errors
 /// As [`read_frame`].
@@ -88,7 +90,7 @@ fn decode<R: Read + Seek>(
     layout: &ChannelLayout,
     reference: Presence,
 ) -> Result<Frame, Error> {
-    let planes = FramePlanes::decode(file, layout, reference, Presence::IfThere)?;
+    let planes = FramePlanes::decode(file, layout, reference, Presence::IfPresent)?;
     let name = file
         .path()
         .file_stem()
@@ -120,25 +122,26 @@ pub struct FramePlanes {
     pub features: Vec<Plane>,
     /// Reference colour: 3 planes.
     pub reference: Option<Vec<Plane>>,
-    /// Share of the camera rays that hit.
+    /// Share of the camera rays that hit a surface.
     pub mask: Option<Plane>,
-    /// How many negative samples of colour and reference were set to 0.
+    /// Number of negative samples of colour and reference that were set to 0.
     pub clamped: usize,
 }
 
-/// Whether a buffer that is not a feature is read.
+/// Whether reference or mask is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Presence {
     /// It is not read.
     Skip,
-    /// It is read where the layout names it and the file has it.
-    IfThere,
-    /// It is read where the layout names it; a file without it is refused.
+    /// It is read if the layout names it and the file has it.
+    IfPresent,
+    /// It is read if the layout names it; a file without it is refused.
     Required,
 }
 
 impl FramePlanes {
-    /// Reads and checks an image, on this thread alone: who reads many has threads of its own.
+    /// Reads and checks an image on the calling thread alone; callers that read many images have
+    /// their own threads.
     ///
     /// # Errors
     /// As [`read_frame`].
@@ -152,7 +155,7 @@ impl FramePlanes {
         Self::decode(&mut file, layout, reference, mask)
     }
 
-    /// Decodes and checks an image that is open already.
+    /// Decodes and checks an image of an open file.
     ///
     /// # Errors
     /// As [`read_frame`].
@@ -163,9 +166,9 @@ impl FramePlanes {
         mask: Presence,
     ) -> Result<Self, Error> {
         let path = &file.path().to_owned();
-        let plan = Plan::new(file, layout, reference, mask)?;
-        let window = plan.window(path, file)?;
-        let names = plan.names();
+        let wanted = FrameChannels::new(file, layout, reference, mask)?;
+        let window = wanted.window(path, file)?;
+        let names = wanted.names();
         let mut decoded = names
             .iter()
             .copied()
@@ -191,10 +194,10 @@ impl FramePlanes {
         let mut planes = Self {
             width: window.width,
             height: window.height,
-            color: take(&plan.color)?,
-            features: take(&plan.features)?,
-            reference: plan.reference.as_deref().map(&mut take).transpose()?,
-            mask: take(&plan.mask)?.pop(),
+            color: take(&wanted.color)?,
+            features: take(&wanted.features)?,
+            reference: wanted.reference.as_deref().map(&mut take).transpose()?,
+            mask: take(&wanted.mask)?.pop(),
             clamped: 0,
         };
         let radiance = planes
@@ -205,7 +208,7 @@ impl FramePlanes {
         Ok(planes)
     }
 
-    /// Memory of all samples, in bytes.
+    /// Memory of all samples in bytes.
     pub fn bytes(&self) -> usize {
         let radiance = self.color.iter().chain(self.reference.iter().flatten());
         radiance
@@ -216,46 +219,47 @@ impl FramePlanes {
     }
 }
 
-/// Checks a file's header: it has what the layout and `reference` ask for, in buffers of one size. Decodes
-/// no pixels.
+/// Checks a file's header: it has the channels of the layout and `reference`, in buffers of one
+/// size. Decodes no pixels.
 ///
 /// # Errors
-/// As [`read_frame`], pixel data aside.
+/// As [`read_frame`], except for pixel data.
 pub fn check_header(
     path: &Path,
     layout: &ChannelLayout,
     reference: Presence,
 ) -> Result<Window, Error> {
     let file = ExrFile::open(path)?;
-    Plan::new(&file, layout, reference, Presence::IfThere)?.window(path, &file)
+    FrameChannels::new(&file, layout, reference, Presence::IfPresent)?.window(path, &file)
 }
 
-/// Which channel goes where; `None` stands for zeros.
-struct Plan<'a> {
+/// The channels of a frame; `None` stands for zeros.
+struct FrameChannels<'a> {
     color: Vec<Option<&'a str>>,
     features: Vec<Option<&'a str>>,
     reference: Option<Vec<Option<&'a str>>>,
     mask: Vec<Option<&'a str>>,
 }
 
-impl<'a> Plan<'a> {
+impl<'a> FrameChannels<'a> {
     fn new<R: Read + Seek>(
         file: &ExrFile<R>,
         layout: &'a ChannelLayout,
         reference: Presence,
         mask: Presence,
     ) -> Result<Self, Error> {
-        let there = |names: &[String]| names.iter().any(|name| file.channel(name).is_some());
+        let is_present = |names: &[String]| names.iter().any(|name| file.channel(name).is_some());
         let read = |presence: Presence, names: &[String]| match presence {
             Presence::Skip => false,
-            Presence::IfThere => there(names),
+            Presence::IfPresent => is_present(names),
             Presence::Required => true,
         };
         let mut features: Vec<Option<&str>> = Vec::with_capacity(FEATURES);
         for (buffer, names, missing) in layout.features() {
             match (names, missing) {
-                // One channel of three is enough to be there: the others are then missing, whatever the policy.
-                (Some(names), policy) if policy == Missing::Error || there(names) => {
+                // If one of the three channels is present, the buffer counts as present, and the
+                // other channels are missing.
+                (Some(names), policy) if policy == Missing::Error || is_present(names) => {
                     features.extend(slots(names))
                 }
                 (None, Missing::Error) => {
@@ -277,17 +281,17 @@ impl<'a> Plan<'a> {
             .mask
             .iter()
             .filter(|name| read(mask, std::slice::from_ref(name)));
-        let plan = Self {
+        let wanted = Self {
             color: slots(&layout.color),
             features,
             reference: reference.map(slots),
             mask: mask.map(|name| Some(name.as_str())).collect(),
         };
-        file.require(&plan.names())?;
-        Ok(plan)
+        file.require(&wanted.names())?;
+        Ok(wanted)
     }
 
-    /// The channels to decode, in the order of the fields; a copied texture comes twice.
+    /// The channels to decode, in the order of the fields; a copied texture appears twice.
     fn names(&self) -> Vec<&'a str> {
         let radiance_and_features = self.color.iter().chain(&self.features);
         radiance_and_features
@@ -298,7 +302,7 @@ impl<'a> Plan<'a> {
             .collect()
     }
 
-    /// The window that all channels have in common.
+    /// The window that all channels share.
     fn window<R: Read + Seek>(&self, path: &Path, file: &ExrFile<R>) -> Result<Window, Error> {
         let names = self.names();
         let mut channels = names.iter().filter_map(|name| file.channel(name));
@@ -320,7 +324,7 @@ fn slots(names: &Triple) -> Vec<Option<&str>> {
     names.iter().map(|name| Some(name.as_str())).collect()
 }
 
-/// Planes of one size, one after another.
+/// Concatenates planes of one size.
 fn planar(planes: &[Plane]) -> Vec<f32> {
     let pixels = planes.first().map_or(0, Plane::len);
     let mut samples = vec![0.0; planes.len() * pixels];

@@ -1,6 +1,6 @@
-//! Which channel of a renderer's files is which of the network's planes. Swapped buffers are the commonest
-//! silent failure in this field, so a layout is always explicit: a preset or a TOML file expands to a table
-//! of names, and a buffer that a renderer lacks has a stated policy. The layout travels with the weights.
+//! The mapping from a renderer's channels to the network's planes. Swapped buffers are a common
+//! silent failure, so a layout is always explicit: a preset or a TOML file lists the names. A
+//! buffer that a renderer lacks has a stated policy. The layout is stored with the weights.
 //!
 //! ```toml
 //! color    = ["R", "G", "B"]
@@ -8,7 +8,7 @@
 //! position = ["position.X", "position.Y", "position.Z"]
 //! texture1 = ["albedo.R", "albedo.G", "albedo.B"]
 //!
-//! [missing]                   # "error" where nothing is said; "zeros"; for texture2 also "copy-texture1"
+//! [missing]                   # "error" (default) or "zeros"; for texture2 also "copy-texture1"
 //! texture2 = "copy-texture1"
 //! ```
 
@@ -19,7 +19,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::Error;
 
-/// The layouts that come with the crate: name and TOML text (`configs/renderers/`).
+/// The built-in layouts: name and TOML text (`configs/renderers/`).
 pub const PRESETS: [(&str, &str); 5] = [
     (
         "demc-exr",
@@ -64,15 +64,16 @@ pub struct ChannelLayout {
     /// Reference colour, for training and evaluation.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reference: Option<Triple>,
-    /// Share of a pixel's camera rays that hit a surface, 0 to 1; tells the statistics which pixels to leave out.
+    /// Share of a pixel's camera rays that hit a surface, from 0 to 1. Statistics exclude pixels
+    /// without a hit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mask: Option<String>,
-    /// What to do where a feature buffer is not there.
+    /// Policies for missing feature buffers.
     #[serde(default)]
     pub missing: MissingPolicies,
 }
 
-/// What stands in for each feature buffer that a file lacks.
+/// The replacement for each missing feature buffer.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MissingPolicies {
@@ -86,11 +87,11 @@ pub struct MissingPolicies {
     pub texture2: Missing,
 }
 
-/// What stands in for a buffer that a file lacks.
+/// The replacement for a missing buffer.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Missing {
-    /// Nothing: the file is refused.
+    /// No replacement: the file is refused.
     #[default]
     Error,
     /// Zeros.
@@ -100,10 +101,11 @@ pub enum Missing {
 }
 
 impl ChannelLayout {
-    /// The layout of this name: a preset, or else the TOML file at this path.
+    /// The layout with this name: a preset, or the TOML file at this path.
     ///
     /// # Errors
-    /// [`Error::Layout`], naming the presets if the name is neither, or the line and key of a mistake.
+    /// [`Error::Layout`], naming the presets if `name` is neither, or the line and key of a
+    /// mistake.
     pub fn resolve(name: &str) -> Result<Self, Error> {
         let text = match PRESETS.iter().find(|(preset, _)| *preset == name) {
             Some((_, text)) => (*text).to_owned(),
@@ -124,7 +126,7 @@ impl ChannelLayout {
         Self::from_toml(name, &text)
     }
 
-    /// Parses and checks a layout; `name` is for messages.
+    /// Parses and checks a layout; errors refer to it as `name`.
     ///
     /// # Errors
     /// [`Error::Layout`].
@@ -137,7 +139,8 @@ impl ChannelLayout {
         }
     }
 
-    /// The four feature buffers in the network's order, each with its policy: normal, position, texture1, texture2.
+    /// The four feature buffers in the network's order, each with its policy: normal, position,
+    /// texture1, texture2.
     pub fn features(&self) -> [(&'static str, Option<&Triple>, Missing); 4] {
         [
             ("normal", self.normal.as_ref(), self.missing.normal),
@@ -147,7 +150,7 @@ impl ChannelLayout {
         ]
     }
 
-    /// Everything that is wrong with this layout, one phrase each.
+    /// All problems of this layout, one phrase each.
     pub fn validate(&self) -> Vec<String> {
         let mut problems = Vec::new();
         for (buffer, names, missing) in self.features() {
@@ -177,7 +180,7 @@ impl ChannelLayout {
                 problems.push(format!("channel {name:?} is named twice"));
             }
             if name.contains(char::is_control) {
-                problems.push(format!("channel {name:?} is no name"));
+                problems.push(format!("channel {name:?} contains a control character"));
             }
         }
         problems
@@ -191,10 +194,10 @@ fn mistake(name: &str, detail: String) -> Error {
     }
 }
 
-/// A TOML error as `line N: what`.
+/// A TOML error as `line N: message`.
 fn one_line(error: &toml::de::Error, text: &str) -> String {
     let message = error.message().trim_end().replace('\n', ", ");
-    // A key may hold codes that a terminal obeys.
+    // A key may contain terminal control codes.
     let message = message.replace(char::is_control, "\u{fffd}");
     match error.span() {
         Some(span) => {

@@ -1,10 +1,13 @@
-//! Files, statistics, patches and batches: everything between rendered images on disk and the plain `f32`
-//! buffers that the network eats. Knows nothing of tensors or devices.
+//! Files, statistics, patches and batches: the steps from rendered images on disk to the plain
+//! `f32` buffers that the network takes as input. This crate does not depend on tensors or devices.
 //!
-//! A file's way, in the order of the modules: [`exr`] decodes channels, [`layout`] says which channel is
-//! what, [`frame`] checks the buffers and holds them, [`transform`] takes them to the network's space.
-//! Training adds [`dataset`] (scenes and splits), [`stats`] (what [`transform`] subtracts and divides by),
-//! [`patch`] (which pixels, in which order), [`cache`] and [`batch`] (decoded ahead on threads).
+//! The modules, in the order of use: [`exr`] decodes channels, [`layout`] maps them to buffers,
+//! [`frame`] checks and holds the buffers, [`transform`] converts them to the network's input
+//! space.
+//!
+//! Training adds [`dataset`] (scenes and splits), [`stats`] (the statistics that [`transform`]
+//! uses), [`patch`] (patches and their order), [`cache`] (decoded scenes) and [`batch`] (batches,
+//! prepared on threads).
 //!
 //! ```
 //! use demc_data::{ChannelLayout, read_frame};
@@ -28,11 +31,11 @@ pub mod file;
 pub mod frame;
 pub mod layout;
 pub mod loader;
+mod moments;
 mod parallel;
 pub mod patch;
 pub mod plane;
 pub mod ranges;
-pub mod reference_filter;
 pub mod resample;
 pub mod rgb;
 mod seed;
@@ -44,13 +47,13 @@ pub use batch::{Batch, PatchSource};
 pub use config::DataConfig;
 pub use dataset::{Dataset, Scene, Split};
 pub use error::Error;
-pub use exr::rewrite::{self, Change, Keep, WriteOptions, Written, write_denoised};
-pub use exr::{Compression, Precision, write_rgb};
+pub use exr::rewrite::{self, Change, OutputChannels, WriteOptions, Written, write_denoised};
+pub use exr::{Compression, SamplePrecision, write_rgb};
 pub use frame::{FEATURES, Frame, read_frame};
 pub use layout::ChannelLayout;
 pub use loader::BatchLoader;
 pub use patch::{Border, Patch};
-pub use ranges::{Ranges, Summary};
+pub use ranges::{FrameSummary, Ranges};
 pub use rgb::{Rgb, read_rgb};
 pub use stats::Statistics;
 pub use transform::{FeatureStats, Normalizer};

@@ -1,6 +1,6 @@
-//! Batches made ahead of their use on background threads. Worker w of W makes batches w, w + W, w + 2 W, ...
-//! and hands them over through a channel of its own; the consumer takes from the channels in turn. So the
-//! order is that of the stream whatever the threads do, and no more than two batches a worker wait.
+//! Batches prepared on background threads. Worker w of W makes batches w, w + W, w + 2 W, ... and
+//! sends them through its own channel. The consumer receives from the channels in turn, so the
+//! order does not depend on the threads. At most two batches per worker wait.
 
 use std::panic::resume_unwind;
 use std::sync::Arc;
@@ -9,8 +9,8 @@ use std::thread::{self, JoinHandle};
 
 use crate::{Batch, Error, PatchSource};
 
-/// Finished batches that a worker may have waiting while it makes the next one. A batch of 64 patches of
-/// 128 x 128 is 75 MB.
+/// Finished batches that may wait per worker while it makes the next one. A batch of 64 patches of
+/// 128 x 128 takes 75 MB.
 const AHEAD: usize = 1;
 
 /// Delivers the batches of a run in order. Dropping it ends and joins its threads.
@@ -26,7 +26,7 @@ struct Worker {
 }
 
 impl BatchLoader {
-    /// Starts `source.workers()` threads; the first batch delivered is `start`.
+    /// Starts `source.workers()` threads; `start` is the number of the first batch.
     pub fn new(source: Arc<PatchSource>, start: u64) -> Self {
         let stride = source.workers().max(1);
         let worker = |first: u64| {
@@ -34,7 +34,7 @@ impl BatchLoader {
             let (sender, batches) = sync_channel(AHEAD);
             let thread = thread::spawn(move || {
                 for n in (first..).step_by(stride) {
-                    // The receiver is gone when the loader was dropped.
+                    // The receiver is closed when the loader is dropped.
                     if sender.send(source.batch(n)).is_err() {
                         break;
                     }
@@ -52,7 +52,7 @@ impl BatchLoader {
     /// Waits for the next batch.
     ///
     /// # Errors
-    /// As [`PatchSource::batch`], at the batch that the scene was needed for.
+    /// As [`PatchSource::batch`], for the batch that failed.
     #[expect(
         clippy::should_implement_trait,
         reason = "the stream is endless: an Option would never be None"
@@ -73,13 +73,13 @@ impl BatchLoader {
 
 impl Drop for BatchLoader {
     fn drop(&mut self) {
-        // All receivers first: every worker then stops at its next delivery.
+        // Closes all receivers first, so that every worker stops at its next delivery.
         for worker in &mut self.workers {
             worker.batches = None;
         }
         for worker in &mut self.workers {
             if let Some(thread) = worker.thread.take() {
-                // A panic was reported by the thread itself, and a drop must not panic.
+                // The thread has already reported its panic, and a drop must not panic.
                 let _ = thread.join();
             }
         }

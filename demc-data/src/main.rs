@@ -1,4 +1,4 @@
-//! `demc-data`: looks into images and data sets before anything is trained on them.
+//! `demc-data`: inspects images and data sets before training.
 
 mod cli;
 

@@ -1,5 +1,5 @@
-//! Work on many items at once, on threads of its own: those of a pool may be waiting for the thread that asks, as the
-//! ones that train do for their loader.
+//! Parallel work on separate threads. The threads of a pool may wait for the calling thread, as
+//! training threads wait for their loader, so a pool could deadlock.
 
 use std::env;
 use std::num::NonZero;
@@ -7,10 +7,10 @@ use std::panic::resume_unwind;
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::thread::{self, Builder};
 
-/// The variable that bounds rayon's pool bounds these threads, too.
+/// The variable that limits rayon's pool also limits these threads.
 const LIMIT: &str = "RAYON_NUM_THREADS";
 
-/// How many threads to use: what [`LIMIT`] says, or as many as there are processors for this process.
+/// Number of threads: [`LIMIT`], or the number of processors available to this process.
 pub(crate) fn available() -> usize {
     static AVAILABLE: OnceLock<usize> = OnceLock::new();
     *AVAILABLE.get_or_init(|| {
@@ -19,14 +19,14 @@ pub(crate) fn available() -> usize {
     })
 }
 
-/// As rayon reads the variable: 0 and what is no number say nothing.
+/// Reads the variable as rayon does: ignores 0 and values that are not numbers.
 fn limited(variable: Option<&str>, processors: usize) -> usize {
     let asked = variable.and_then(|value| value.parse().ok());
     asked.filter(|threads| *threads > 0).unwrap_or(processors)
 }
 
-/// What `work` makes of each item, in their order, on so many threads, this one among them. Where the system has no more
-/// threads, those that there are do it.
+/// Maps `work` over the items, in order, on this many threads including the calling one. If the
+/// system cannot start more threads, the available ones do the work.
 pub(crate) fn map<T: Send, U: Send>(
     threads: usize,
     items: Vec<T>,
@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn the_variable_of_rayon_counts_here_too() {
+    fn rayons_variable_limits_the_threads() {
         for (variable, threads) in [("1", 1), ("3", 3), ("0", 8), ("", 8), ("two", 8)] {
             assert_eq!(limited(Some(variable), 8), threads, "{variable:?}");
         }

@@ -1,16 +1,18 @@
-//! Which pixels a training example is cut from, and in which order: patches on a grid over every scene
-//! (Sec. 4.2: 128 x 128 at stride 80), shuffled anew each epoch. A patch is an index, never a file.
+//! Training patches and their order: a grid over every scene (Sec. 4.2: 128 x 128 at stride 80),
+//! shuffled again each epoch. A patch is an index, not a file.
+
+use std::sync::{Arc, Mutex, PoisonError};
 
 use rand::seq::SliceRandom;
 use serde::{Deserialize, Serialize};
 
-use crate::seed::{Use, generator};
+use crate::seed::{RandomStream, generator};
 use crate::{Error, Scene};
 
 /// A square of a scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Patch {
-    /// Index of the scene in the list that the patches were made from.
+    /// Index of the scene in the list that the patches are made from.
     pub scene: u32,
     /// Top edge, in pixels.
     pub y: u32,
@@ -18,13 +20,14 @@ pub struct Patch {
     pub x: u32,
 }
 
-/// What happens at the right and lower edge, where the grid leaves pixels over (ours: the paper is silent).
+/// Handling of the right and lower edge, where the grid leaves pixels over (ours: the paper is
+/// silent).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Border {
-    /// A last column and row of patches, moved to the edge: every pixel is in some patch.
+    /// Adds a last column and row of patches, moved to the edge, so that every pixel is in a patch.
     Shift,
-    /// They are left out.
+    /// Leaves these pixels out.
     Drop,
 }
 
@@ -65,7 +68,7 @@ pub fn patches(
     Ok(patches)
 }
 
-/// Where patches of `size` start along an edge of `length` pixels; empty if none fits.
+/// Start positions of patches of `size` along an edge of `length` pixels; empty if no patch fits.
 fn origins(length: usize, size: usize, stride: usize, border: Border) -> Vec<u32> {
     assert!(
         size > 0 && stride > 0,
@@ -84,12 +87,44 @@ fn origins(length: usize, size: usize, stride: usize, border: Border) -> Vec<u32
     origins
 }
 
-/// The order in which epoch `epoch` visits `count` patches: a permutation of `0..count` that depends on
-/// `seed` and `epoch` only.
+/// The order in which an epoch visits `count` patches: a permutation of `0..count` that depends
+/// only on `seed` and `epoch`.
 pub fn epoch_order(count: usize, seed: u64, epoch: u64) -> Vec<u32> {
     let mut order: Vec<u32> = (0..count as u32).collect();
-    order.shuffle(&mut generator(Use::Shuffle, seed, epoch, 0));
+    order.shuffle(&mut generator(RandomStream::Shuffle, seed, epoch, 0));
     order
+}
+
+/// The orders of a run's epochs. The latest order is cached, because every batch of an epoch uses
+/// it and a shuffle takes time proportional to the number of patches.
+pub(crate) struct EpochOrders {
+    count: usize,
+    seed: u64,
+    latest: Mutex<Option<(u64, Arc<[u32]>)>>,
+}
+
+impl EpochOrders {
+    pub(crate) fn new(count: usize, seed: u64) -> Self {
+        Self {
+            count,
+            seed,
+            latest: Mutex::default(),
+        }
+    }
+
+    /// [`epoch_order`] of `epoch`. Threads that need a new epoch at the same time shuffle it once.
+    pub(crate) fn get(&self, epoch: u64) -> Arc<[u32]> {
+        // A single assignment replaces the value, so a panic leaves it consistent.
+        let mut latest = self.latest.lock().unwrap_or_else(PoisonError::into_inner);
+        match &*latest {
+            Some((known, order)) if *known == epoch => Arc::clone(order),
+            _ => {
+                let order: Arc<[u32]> = epoch_order(self.count, self.seed, epoch).into();
+                *latest = Some((epoch, Arc::clone(&order)));
+                order
+            }
+        }
+    }
 }
 
 #[cfg(test)]
@@ -106,7 +141,6 @@ mod tests {
             width,
             height,
             ref_residual_relmse: None,
-            ref_denoised: None,
             other: serde_json::Map::new(),
         }
     }
@@ -170,5 +204,21 @@ mod tests {
         assert_eq!(order, epoch_order(90, 7, 3));
         assert_ne!(order, epoch_order(90, 7, 4));
         assert_ne!(order, epoch_order(90, 8, 3));
+    }
+
+    #[test]
+    fn a_kept_order_is_that_of_its_epoch_on_any_thread() {
+        let orders = EpochOrders::new(90, 7);
+        std::thread::scope(|scope| {
+            for first in 0..4 {
+                let orders = &orders;
+                scope.spawn(move || {
+                    for epoch in [first, 0, 1, 1, 0] {
+                        assert_eq!(orders.get(epoch)[..], epoch_order(90, 7, epoch));
+                    }
+                });
+            }
+        });
+        assert!(Arc::ptr_eq(&orders.get(5), &orders.get(5)));
     }
 }

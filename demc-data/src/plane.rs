@@ -1,5 +1,5 @@
-//! One channel of an image in the precision that its file has: half planes stay half in the scene cache,
-//! at half the memory.
+//! One channel of an image in the precision of its file. Half planes stay half in the scene cache,
+//! which saves half the memory.
 
 use half::f16;
 use half::slice::HalfFloatSliceExt;
@@ -16,7 +16,7 @@ pub enum Plane {
 }
 
 impl Plane {
-    /// A half plane of `samples` zeros: what stands in for a buffer that a layout declares as zeros.
+    /// A half plane of `samples` zeros, for a buffer that a layout declares as zeros.
     pub fn zeros(samples: usize) -> Self {
         Plane::Half(vec![f16::ZERO; samples])
     }
@@ -35,12 +35,12 @@ impl Plane {
         self.len() == 0
     }
 
-    /// Memory of the samples, in bytes.
+    /// Memory of the samples in bytes.
     pub fn bytes(&self) -> usize {
         self.len() * if matches!(self, Plane::Half(_)) { 2 } else { 4 }
     }
 
-    /// Writes the samples from `start` on as `f32` to `out`, as many as it takes.
+    /// Copies samples from `start` on to `out` as `f32`, until `out` is full.
     ///
     /// # Panics
     /// If the plane ends before `out` is full.
@@ -64,7 +64,8 @@ impl Plane {
         out
     }
 
-    /// The first NaN or infinite sample (index and value) and how many there are, or `None`.
+    /// The first NaN or infinite sample (index and value) and the number of such samples, or
+    /// `None`.
     pub fn non_finite(&self) -> Option<(usize, f32, usize)> {
         match self {
             Plane::Half(samples) => bad(samples, f16::is_finite, f16::to_f32),
@@ -73,7 +74,7 @@ impl Plane {
         }
     }
 
-    /// Sets negative samples to 0 and returns how many there were (-0 is not negative).
+    /// Sets negative samples to 0 and returns their number (-0 is not negative).
     pub fn clamp_negative(&mut self) -> usize {
         match self {
             Plane::Half(samples) => clamp(samples, f16::ZERO),
@@ -83,7 +84,7 @@ impl Plane {
     }
 }
 
-/// Counts first: most planes have none, and that is the faster question.
+/// Counts first, which is faster for the usual plane without bad samples.
 fn bad<T: Copy>(
     samples: &[T],
     finite: impl Fn(T) -> bool,

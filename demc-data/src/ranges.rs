@@ -1,42 +1,43 @@
-//! What the training scenes were like, scene by scene: so that an image that is unlike all of them can be told so.
+//! Ranges of summary values over the training scenes, used to detect images unlike all of them.
 
 use serde::{Deserialize, Serialize};
 
 use crate::frame::{FEATURES, Frame, TEXTURES};
-use crate::stats::{Moments, hit_samples};
+use crate::moments::{ChannelMoments, hit_samples};
 
 /// Rec. 709 luminance of red, green and blue.
 const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
-/// Exponent of the mean that stands for an image's exposure: dark pixels count, a firefly hardly does (ours).
+/// Exponent of the mean that estimates an image's exposure. Dark pixels count; a firefly hardly
+/// does (ours).
 const EXPOSURE_GAMMA: f64 = 2.2;
-/// Share of the training scenes that lie below and above a range (ours).
+/// Share of the training scenes below and above a range (ours).
 const TAIL: f64 = 0.05;
 
-/// One image in a few numbers.
+/// Summary values of one image.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Summary {
+pub struct FrameSummary {
     /// `mean(luminance^(1/2.2))^2.2` of the noisy colour, linear HDR.
     pub exposure: f64,
-    /// Mean of each feature channel; of normals and positions where something was hit.
+    /// Mean of each feature channel; for normals and positions over pixels with a hit.
     pub mean: [f64; FEATURES],
-    /// Standard deviation of each feature channel, likewise.
+    /// Standard deviation of each feature channel, over the same pixels.
     pub std: [f64; FEATURES],
 }
 
-impl Summary {
+impl FrameSummary {
     /// The summary of a frame.
     pub fn of(frame: &Frame) -> Self {
         let pixels = frame.width * frame.height;
         let mut planes = frame.features.chunks_exact(pixels.max(1));
         let features = std::array::from_fn(|channel| {
             let plane = planes.next().unwrap_or_default().to_vec();
-            Moments::of(&hit_samples(channel, plane, frame.mask.as_deref()))
+            ChannelMoments::of(&hit_samples(channel, plane, frame.mask.as_deref()))
         });
         Self::new(&frame.color, &features)
     }
 
     /// From the noisy colour, planar `[3, N]`, and the moments of the features.
-    pub(crate) fn new(color_hdr: &[f32], features: &[Moments; FEATURES]) -> Self {
+    pub(crate) fn new(color_hdr: &[f32], features: &[ChannelMoments; FEATURES]) -> Self {
         let pixels = color_hdr.len() / 3;
         let compressed: f64 = (0..pixels)
             .map(|i| {
@@ -53,7 +54,7 @@ impl Summary {
     }
 }
 
-/// The least and the most of some scenes, 5 % of them left out at either end.
+/// The range of a value over some scenes, without 5 % of them at either end.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Range {
@@ -68,14 +69,15 @@ impl Range {
     fn of(mut values: Vec<f64>) -> Self {
         values.sort_by(f64::total_cmp);
         let last = values.len().saturating_sub(1) as f64;
-        let at = |share: f64| *values.get((share * last).round() as usize).unwrap_or(&0.0) as f32;
+        let quantile =
+            |share: f64| *values.get((share * last).round() as usize).unwrap_or(&0.0) as f32;
         Self {
-            low: at(TAIL),
-            high: at(1.0 - TAIL),
+            low: quantile(TAIL),
+            high: quantile(1.0 - TAIL),
         }
     }
 
-    /// The range that holds both.
+    /// The smallest range that contains both.
     fn with(self, other: Self) -> Self {
         Self {
             low: self.low.min(other.low),
@@ -84,22 +86,23 @@ impl Range {
     }
 }
 
-/// Where the summaries of the training scenes lie.
+/// Ranges of the summary values over the training scenes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ranges {
-    /// Of [`Summary::exposure`].
+    /// Range of [`FrameSummary::exposure`].
     pub exposure: Range,
-    /// Of [`Summary::mean`], channel by channel.
+    /// Range of [`FrameSummary::mean`] per channel.
     pub mean: [Range; FEATURES],
-    /// Of [`Summary::std`], channel by channel.
+    /// Range of [`FrameSummary::std`] per channel.
     pub std: [Range; FEATURES],
 }
 
 impl Ranges {
     /// The ranges of these scenes.
-    pub fn of(scenes: &[Summary]) -> Self {
-        let range = |value: &dyn Fn(&Summary) -> f64| Range::of(scenes.iter().map(value).collect());
+    pub fn of(scenes: &[FrameSummary]) -> Self {
+        let range =
+            |value: &dyn Fn(&FrameSummary) -> f64| Range::of(scenes.iter().map(value).collect());
         Self {
             exposure: range(&|scene| scene.exposure),
             mean: std::array::from_fn(|channel| range(&|scene| scene.mean[channel])),
@@ -107,8 +110,8 @@ impl Ranges {
         }
     }
 
-    /// These, of scenes that were shown with their axes told in all ways ([`crate::Augment::axes`]): each axis of normals and positions has been
-    /// any other, pointing either way.
+    /// The ranges under random axis permutation and mirroring ([`crate::Augment::axes`]): each axis
+    /// of normals and positions may be any other, in either direction.
     pub fn in_any_axes(&self) -> Self {
         let (mut mean, mut std) = (self.mean, self.std);
         let axes = mean[..TEXTURES].chunks_mut(3);
@@ -128,7 +131,7 @@ impl Ranges {
         }
     }
 
-    /// These and those of the scenes that the same weights saw before.
+    /// The ranges that contain these and those of earlier training with the same weights.
     pub fn with(&self, before: &Ranges) -> Self {
         let both = |a: &[Range; FEATURES], b: &[Range; FEATURES]| {
             std::array::from_fn(|channel| a[channel].with(b[channel]))
@@ -160,7 +163,7 @@ mod tests {
 
     #[test]
     fn a_flat_image_has_its_own_exposure_and_moments() {
-        let summary = Summary::of(&frame(0.25, 3.0));
+        let summary = FrameSummary::of(&frame(0.25, 3.0));
         assert!((summary.exposure - 0.25).abs() < 1e-6);
         assert_eq!((summary.mean[3], summary.std[3]), (3.5, 0.5));
     }
@@ -169,15 +172,15 @@ mod tests {
     fn misses_do_not_count_for_geometry() {
         let mut frame = frame(0.25, 3.0);
         frame.mask = Some([1.0, 0.0].repeat(4));
-        let summary = Summary::of(&frame);
+        let summary = FrameSummary::of(&frame);
         assert_eq!((summary.mean[5], summary.std[5]), (3.0, 0.0));
         assert_eq!((summary.mean[6], summary.std[6]), (3.5, 0.5));
     }
 
     #[test]
-    fn ranges_with_those_before_hold_both() {
-        let of = |color, feature| Ranges::of(&[Summary::of(&frame(color, feature))]);
-        let both = of(0.25, 3.0).with(&of(1.0, 1.0));
+    fn combined_ranges_contain_both() {
+        let ranges = |color, feature| Ranges::of(&[FrameSummary::of(&frame(color, feature))]);
+        let both = ranges(0.25, 3.0).with(&ranges(1.0, 1.0));
         let ends = |range: Range| [range.low, range.high];
         assert!((ends(both.exposure)[0] - 0.25).abs() < 1e-6);
         assert!((ends(both.exposure)[1] - 1.0).abs() < 1e-6);
@@ -187,7 +190,7 @@ mod tests {
 
     #[test]
     fn in_any_axes_each_of_them_may_be_any_other() {
-        let mut ranges = Ranges::of(&[Summary::of(&frame(0.25, 3.0))]);
+        let mut ranges = Ranges::of(&[FrameSummary::of(&frame(0.25, 3.0))]);
         let before = ranges.clone();
         let range = |low, high| Range { low, high };
         ranges.mean[3..6].copy_from_slice(&[range(-7.0, 1.0), range(2.0, 3.0), range(0.0, 5.0)]);
@@ -202,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn a_range_leaves_a_twentieth_out_at_either_end() {
+    fn a_range_excludes_a_twentieth_at_either_end() {
         let range = Range::of((0..=100).rev().map(f64::from).collect());
         let (low, high) = (5.0, 95.0);
         assert_eq!(range, Range { low, high });

@@ -1,4 +1,4 @@
-//! A finished image, whoever made it: three colour channels of a file, whatever else it holds.
+//! A finished image from any program: three colour channels of a file; other channels are ignored.
 
 use std::path::Path;
 
@@ -14,15 +14,16 @@ pub struct Rgb {
     pub height: usize,
     /// `[3, H, W]`: linear HDR, finite, not negative.
     pub planes: Vec<f32>,
-    /// How many negative samples were set to 0.
+    /// Number of negative samples that were set to 0.
     pub clamped: usize,
 }
 
 /// Reads `R`, `G`, `B`, or `LAYER.R`, `LAYER.G`, `LAYER.B` of the only layer that has them.
 ///
 /// # Errors
-/// [`Error::Read`] and [`Error::Exr`] for a file that cannot be decoded, [`Error::MissingChannels`] without such
-/// channels or with those of several layers, [`Error::Sizes`] and [`Error::NonFinite`] for channels that cannot be used.
+/// [`Error::Read`] and [`Error::Exr`] for a file that cannot be decoded. [`Error::MissingChannels`]
+/// without such channels, or with those of several layers. [`Error::Sizes`] and
+/// [`Error::NonFinite`] for unusable channels.
 pub fn read_rgb(path: &Path) -> Result<Rgb, Error> {
     let mut file = ExrFile::open(path)?;
     let prefix = prefix(&file);
@@ -65,7 +66,7 @@ pub fn read_rgb(path: &Path) -> Result<Rgb, Error> {
     })
 }
 
-/// What stands before `R`, `G` and `B`: nothing, or the only layer that has all three.
+/// The prefix of `R`, `G` and `B`: empty, or the only layer that has all three.
 fn prefix(file: &ExrFile) -> String {
     let has_all = |prefix: &str| {
         ["R", "G", "B"]

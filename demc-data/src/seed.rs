@@ -1,23 +1,23 @@
-//! Where all randomness of this crate comes from: ChaCha8, seeded by what it is for and by numbers that a
+//! The source of all randomness in this crate: ChaCha8, seeded by a purpose and by numbers that a
 //! resumed run knows, never by a clock or a thread.
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-/// What a stream of random numbers is for; each use has streams of its own.
+/// The purpose of a stream of random numbers; each purpose has its own streams.
 #[derive(Clone, Copy)]
-pub(crate) enum Use {
+pub(crate) enum RandomStream {
     Validation = 1,
     Shuffle = 2,
     Augment = 3,
 }
 
-/// The generator of one use at (`seed`, `epoch`, `position`).
-pub(crate) fn generator(of: Use, seed: u64, epoch: u64, position: u64) -> ChaCha8Rng {
+/// The generator of one purpose at (`seed`, `epoch`, `position`).
+pub(crate) fn generator(purpose: RandomStream, seed: u64, epoch: u64, position: u64) -> ChaCha8Rng {
     let mut bytes = [0; 32];
     for (part, value) in bytes
         .chunks_exact_mut(8)
-        .zip([of as u64, seed, epoch, position])
+        .zip([purpose as u64, seed, epoch, position])
     {
         part.copy_from_slice(&value.to_le_bytes());
     }

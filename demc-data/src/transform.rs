@@ -1,14 +1,14 @@
-//! The network's input space and the way back, as pure functions: gamma on colour (Eq. 4), which may be divided by
-//! the first texture before, Z-score on features (Sec. 4.2). Their numbers are measured on the training scenes
-//! ([`crate::stats`]) or chosen, and live with the weights.
+//! Conversions to the network's input space and back, as pure functions. Colour gets gamma (Eq. 4)
+//! and optional albedo demodulation; features get Z-scores (Sec. 4.2). The parameters are measured
+//! on the training scenes ([`crate::stats`]) or configured, and are stored with the weights.
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::frame::{FEATURES, TEXTURES};
 
-/// Smallest standard deviation of a feature channel, in the channel's own unit (ours: the paper is silent).
-/// A constant channel becomes zero instead of 0/0; 1e-3 is half precision's spacing at 1, so what falls
-/// below it in a normal or a texture is rounding, not signal.
+/// Minimum standard deviation of a feature channel, in the channel's own unit (ours: the paper is
+/// silent). It makes a constant channel zero instead of 0/0. 1e-3 is half precision's spacing at 1,
+/// so smaller deviations of normals or textures are rounding.
 pub const STD_FLOOR: f32 = 1e-3;
 
 /// Mean and standard deviation of each feature channel over the training scenes.
@@ -21,41 +21,44 @@ pub struct FeatureStats {
     pub std: [f32; FEATURES],
 }
 
-/// Takes colour and features to the network's space and back.
+/// Converts colour and features to the network's input space and back.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Normalizer {
     /// The exponent of Eq. 4 is `1 / gamma`; 2.2 in the paper.
     pub gamma: f32,
-    /// What is added to the first texture where colour is divided by it ([`Self::modulation`]); 0: colour is not divided.
-    #[serde(default, skip_serializing_if = "is_off")]
-    pub demodulate: f32,
-    /// What the Z-score subtracts and divides by.
+    /// Epsilon of the [modulation](Self::modulation); `None`: colour is not divided. Files store it
+    /// as `demodulate`, and 0 there means `None` (bundle format 1).
+    #[serde(
+        rename = "demodulate",
+        default,
+        deserialize_with = "none_if_zero",
+        skip_serializing_if = "Option::is_none"
+    )]
+    pub albedo_demodulation_epsilon: Option<f32>,
+    /// Mean and standard deviation for the Z-score.
     pub features: FeatureStats,
-    /// The flat output with the least RelMSE (Eq. 5) against the training references, in gamma space: where a
-    /// grey head starts.
+    /// The flat output with the least RelMSE (Eq. 5) against the training references, in gamma
+    /// space. A grey head starts with it.
     pub flat_color: [f32; 3],
 }
 
-fn is_off(demodulate: &f32) -> bool {
-    *demodulate == 0.0
+fn none_if_zero<'de, D: Deserializer<'de>>(number: D) -> Result<Option<f32>, D::Error> {
+    f32::deserialize(number).map(|epsilon| (epsilon != 0.0).then_some(epsilon))
 }
 
 impl Normalizer {
-    /// What the network's input colour is divided by and its output multiplied by, in gamma space:
-    /// `(max(t, 0) + demodulate)^(1/gamma)`, t the texture at the first intersection (albedo demodulation, as Bako et al.
-    /// 2017 have it for diffuse light; ours here). What is left is near the light that falls in, and a texture comes back
-    /// as it was. None where `demodulate` is 0.
+    /// The divisor of the network's input colour and the factor on its output, in gamma space:
+    /// `(max(albedo, 0) + epsilon)^(1/gamma)`, with the albedo of the first hit (albedo
+    /// demodulation: Bako et al. 2017 for diffuse light; ours here). `None` without an epsilon.
     ///
     /// # Shapes
     /// `features`, as rendered, is `[12, N]`; returns `[3, N]`.
     ///
     /// # Panics
-    /// If the length is no multiple of 12.
+    /// If the length is not a multiple of 12.
     pub fn modulation(&self, features: &[f32]) -> Option<Vec<f32>> {
-        if is_off(&self.demodulate) {
-            return None;
-        }
+        let epsilon = self.albedo_demodulation_epsilon?;
         assert_eq!(
             features.len() % FEATURES,
             0,
@@ -64,7 +67,7 @@ impl Normalizer {
         let size = features.len() / FEATURES;
         let mut texture = features[TEXTURES * size..(TEXTURES + 3) * size].to_vec();
         for value in &mut texture {
-            *value = value.max(0.0) + self.demodulate;
+            *value = value.max(0.0) + epsilon;
         }
         gamma_from_hdr(&mut texture, self.gamma);
         Some(texture)
@@ -74,29 +77,29 @@ impl Normalizer {
     /// [modulation](Self::modulation).
     pub fn color_gamma_from_hdr(&self, color: &mut [f32], modulation: Option<&[f32]>) {
         gamma_from_hdr(color, self.gamma);
-        for (value, by) in color.iter_mut().zip(modulation.into_iter().flatten()) {
-            *value /= by;
+        for (value, factor) in color.iter_mut().zip(modulation.into_iter().flatten()) {
+            *value /= factor;
         }
     }
 
-    /// Multiplies gamma-compressed colour by the [modulation](Self::modulation) and expands it, in place:
-    /// `max(x, 0)^gamma`.
+    /// Multiplies gamma-compressed colour by the [modulation](Self::modulation) and expands it, in
+    /// place: `max(x, 0)^gamma`.
     pub fn color_hdr_from_gamma(&self, color: &mut [f32], modulation: Option<&[f32]>) {
-        for (value, by) in color.iter_mut().zip(modulation.into_iter().flatten()) {
-            *value *= by;
+        for (value, factor) in color.iter_mut().zip(modulation.into_iter().flatten()) {
+            *value *= factor;
         }
         for value in color {
             *value = value.max(0.0).powf(self.gamma);
         }
     }
 
-    /// Z-scores features in place: `(x - mean) / std`.
+    /// Converts features to Z-scores in place: `(x - mean) / std`.
     ///
     /// # Shapes
     /// `planes` is `[12, N]`.
     ///
     /// # Panics
-    /// If the length is no multiple of 12.
+    /// If the length is not a multiple of 12.
     pub fn features_z_from_raw(&self, planes: &mut [f32]) {
         self.for_each_feature(planes, |value, mean, std| (value - mean) / std);
     }
@@ -107,7 +110,7 @@ impl Normalizer {
     /// `planes` is `[12, N]`.
     ///
     /// # Panics
-    /// If the length is no multiple of 12.
+    /// If the length is not a multiple of 12.
     pub fn features_raw_from_z(&self, planes: &mut [f32]) {
         self.for_each_feature(planes, |value, mean, std| value * std + mean);
     }
@@ -119,7 +122,7 @@ impl Normalizer {
             "features must be [{FEATURES}, N]"
         );
         let (mean, std) = (&self.features.mean, &self.features.std);
-        // A size of 0 would have no chunks: an empty slice has none either way.
+        // A chunk size of 0 would panic; an empty slice has no chunks.
         let size = (planes.len() / FEATURES).max(1);
         for ((plane, &mean), &std) in planes.chunks_exact_mut(size).zip(mean).zip(std) {
             for value in plane {
@@ -148,7 +151,7 @@ mod tests {
         };
         Normalizer {
             gamma: 2.2,
-            demodulate: 0.0,
+            albedo_demodulation_epsilon: None,
             features,
             flat_color: [0.4; 3],
         }
@@ -161,7 +164,7 @@ mod tests {
         normalizer().color_gamma_from_hdr(&mut color, None);
         normalizer().color_hdr_from_gamma(&mut color, None);
         for (back, hdr) in color.into_iter().zip(hdr) {
-            // f32 has 24 bits; two powers lose a few at large exponents.
+            // f32 has 24 bits; two powers lose a few bits at large exponents.
             assert!((back - hdr).abs() <= 1e-5 * hdr, "{back} is not {hdr}");
         }
     }
@@ -174,11 +177,12 @@ mod tests {
         assert_eq!(color[1..], [0.0, 1.0, 0.0]);
     }
 
-    /// A surface of texture 0.43 under light of 2 is light of 2 in a space without textures, and comes back as it was.
+    /// An albedo of 0.43 under light of 2 becomes light of 2 after demodulation, and is restored
+    /// exactly.
     #[test]
-    fn a_texture_is_divided_away_and_comes_back() {
+    fn an_albedo_is_divided_out_and_restored() {
         let normalizer = Normalizer {
-            demodulate: 0.07,
+            albedo_demodulation_epsilon: Some(0.07),
             ..normalizer()
         };
         let mut features = vec![9.0; FEATURES * 2];
@@ -222,7 +226,7 @@ mod tests {
 
     #[test]
     fn each_channel_has_its_own_mean_and_deviation() {
-        // The last channel: mean 5.5, std 3; 8.5 is one deviation above the mean.
+        // The last channel has mean 5.5 and std 3, so 8.5 is one deviation above the mean.
         let mut planes = vec![0.0; FEATURES * 2];
         planes[22..].copy_from_slice(&[8.5, 5.5]);
         normalizer().features_z_from_raw(&mut planes);
@@ -232,14 +236,24 @@ mod tests {
 
     #[test]
     fn statistics_survive_json() {
-        for demodulate in [0.0, 0.07] {
+        for albedo_demodulation_epsilon in [None, Some(0.07)] {
             let normalizer = Normalizer {
-                demodulate,
+                albedo_demodulation_epsilon,
                 ..normalizer()
             };
             let json = serde_json::to_string(&normalizer).expect("plain data");
             let back = serde_json::from_str::<Normalizer>(&json).expect("its own");
             assert_eq!(back, normalizer);
+        }
+    }
+
+    #[test]
+    fn a_demodulate_of_zero_in_a_file_reads_as_none() {
+        let json = serde_json::to_string(&normalizer()).expect("plain data");
+        for (number, expected) in [("0.0", None), ("0", None), ("0.07", Some(0.07))] {
+            let json = json.replacen('{', &format!("{{\"demodulate\":{number},"), 1);
+            let read = serde_json::from_str::<Normalizer>(&json).expect("format 1");
+            assert_eq!(read.albedo_demodulation_epsilon, expected);
         }
     }
 }

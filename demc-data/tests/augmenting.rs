@@ -1,4 +1,4 @@
-//! What augmentations change about a patch, and what they leave as it is.
+//! The effects of augmentations on a patch.
 
 mod support;
 
@@ -7,7 +7,7 @@ use std::collections::HashSet;
 use demc_data::{Augment, Batch, FEATURES};
 use support::batches::first_batch;
 
-/// Colour and second texture move among the pixels of a patch; what it shows does not.
+/// Colour and second texture move among the pixels of a patch; its content does not.
 #[test]
 fn noise_changes_colour_and_second_texture_only() {
     let plain = first_batch(Augment::default());
@@ -43,11 +43,11 @@ fn augmentation_turns_all_buffers_of_a_patch_alike() {
     });
     assert_eq!(turned.patches, plain.patches);
     let corner = |batch: &Batch, b: usize, y: usize, x: usize| {
-        let at = |plane: usize| (plane * 64 + y) * 64 + x;
+        let index = |plane: usize| (plane * 64 + y) * 64 + x;
         (
-            batch.color_gamma[at(b * 3 + 1)],
-            batch.features_z[at(b * FEATURES + 4)],
-            batch.reference_hdr[at(b * 3)],
+            batch.color_gamma[index(b * 3 + 1)],
+            batch.features_z[index(b * FEATURES + 4)],
+            batch.reference_hdr[index(b * 3)],
         )
     };
     let mut corners = HashSet::new();
@@ -64,9 +64,10 @@ fn augmentation_turns_all_buffers_of_a_patch_alike() {
     );
 }
 
-/// Colour, both textures and reference by one order and colour and reference by one factor; normals and positions stay.
+/// One permutation applies to colour, textures and reference, one factor to colour and reference;
+/// normals and positions stay.
 #[test]
-fn rgb_and_exposure_change_what_they_should_alike() {
+fn rgb_and_exposure_change_all_their_buffers_alike() {
     let plain = first_batch(Augment::default());
     let varied = first_batch(Augment {
         rgb: true,
@@ -90,7 +91,7 @@ fn rgb_and_exposure_change_what_they_should_alike() {
         let sum = |planes: &[f32]| planes.iter().map(|v| f64::from(*v)).sum::<f64>();
         let exposure = sum(&after) / sum(&before);
         assert!((0.5..2.0).contains(&exposure), "{exposure}");
-        // Which plane each of the three comes from.
+        // The source plane of each of the three planes.
         let order: Vec<usize> = after
             .chunks(pixels)
             .map(|plane| {
@@ -120,9 +121,9 @@ fn rgb_and_exposure_change_what_they_should_alike() {
     assert!(orders.len() > 1, "seven patches, six orders: {orders:?}");
 }
 
-/// One order and one sign an axis for normals and positions; all else stays.
+/// One permutation with signs applies to normals and positions; the other buffers stay.
 #[test]
-fn axes_are_told_in_other_ways_the_same_for_normals_and_positions() {
+fn axis_permutations_are_the_same_for_normals_and_positions() {
     let plain = first_batch(Augment::default());
     let varied = first_batch(Augment {
         axes: true,
@@ -139,10 +140,10 @@ fn axes_are_told_in_other_ways_the_same_for_normals_and_positions() {
     let (mut ways, mut mirrored) = (HashSet::new(), HashSet::new());
     for (before, after) in before.chunks(FEATURES).zip(after.chunks(FEATURES)) {
         assert_eq!(before[6..], after[6..], "textures");
-        // Positions tell the way: where a patch shows one wall, two axes of its normal are alike.
+        // Positions decide: where a patch shows a single wall, two axes of its normal are equal.
         let sign = |turned| if turned { -1.0 } else { 1.0 };
-        let is = |plane: &[f32], of: &[f32], turned: bool| {
-            of.iter().zip(plane).all(|(a, b)| a * sign(turned) == *b)
+        let is = |plane: &[f32], other: &[f32], turned: bool| {
+            other.iter().zip(plane).all(|(a, b)| a * sign(turned) == *b)
         };
         let way: Vec<(usize, bool)> = (3..6)
             .map(|plane| {

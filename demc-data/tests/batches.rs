@@ -1,4 +1,4 @@
-//! Batches: the same for any number of workers, in bounded memory, with errors that arrive.
+//! Batches do not depend on the number of workers, need bounded memory, and report errors.
 
 mod support;
 
@@ -26,15 +26,7 @@ fn load(config: &DataConfig, start: u64, count: usize) -> Vec<Batch> {
 fn batches_are_the_same_for_any_number_of_workers() {
     let config = |workers| DataConfig {
         workers,
-        augment: Augment {
-            flip: true,
-            transpose: true,
-            rgb: true,
-            exposure: true,
-            axes: true,
-            crop: true,
-            noise: true,
-        },
+        augment: Augment::ALL,
         ..small()
     };
     let one = load(&config(1), 0, 15);
@@ -43,7 +35,7 @@ fn batches_are_the_same_for_any_number_of_workers() {
 }
 
 #[test]
-fn a_loader_that_starts_later_goes_on_in_the_same_stream() {
+fn a_loader_that_starts_later_continues_the_same_stream() {
     // 10 scenes of 3 x 3 patches: batch 12 ends the first epoch and begins the second.
     assert_eq!(load(&small(), 11, 4), load(&small(), 0, 15)[11..]);
 }
@@ -72,12 +64,15 @@ fn a_batch_larger_than_an_epoch_takes_from_several() {
     })
     .batch(0)
     .expect("the sample is sound");
-    assert_eq!((batch.size, batch.patches.len()), (200, 200));
+    assert_eq!(
+        (batch.size, batch.patches.len(), batch.patch_size),
+        (200, 200, 64)
+    );
     let patches: HashSet<_> = batch.patches[90..180].iter().collect();
     assert_eq!(patches.len(), 90);
 }
 
-/// On the grid and off it.
+/// Patches on the grid and off the grid.
 #[test]
 fn a_patch_holds_the_pixels_of_its_place() {
     holds_the_pixels_of_its_place(&source(&small()));
@@ -103,42 +98,34 @@ fn holds_the_pixels_of_its_place(source: &PatchSource) {
         let (y, x) = (63, 17);
         let pixel = (patch.y as usize + y) * frame.width + patch.x as usize + x;
         let size = frame.width * frame.height;
-        let at = |channels: usize, channel: usize| ((b * channels + channel) * 64 + y) * 64 + x;
+        let index = |channels: usize, channel: usize| ((b * channels + channel) * 64 + y) * 64 + x;
         for channel in 0..FEATURES {
             assert_eq!(
-                batch.features_z[at(FEATURES, channel)],
+                batch.features_z[index(FEATURES, channel)],
                 frame.features[channel * size + pixel]
             );
         }
         let reference = frame.reference.expect("it is there");
         for channel in 0..3 {
             assert_eq!(
-                batch.reference_hdr[at(3, channel)],
+                batch.reference_hdr[index(3, channel)],
                 reference[channel * size + pixel]
             );
             let gamma = frame.color[channel * size + pixel].powf(1.0 / 2.2);
-            assert_eq!(batch.color_gamma[at(3, channel)], gamma);
+            assert_eq!(batch.color_gamma[index(3, channel)], gamma);
         }
     }
 }
 
-/// Whatever else is done to a patch: what the network gets, times the modulation, is its colour.
+/// With every augmentation enabled, the network's input times the modulation is its colour.
 #[test]
 fn a_demodulated_batch_times_its_modulation_is_the_plain_one() {
     let config = DataConfig {
-        augment: Augment {
-            flip: true,
-            transpose: true,
-            rgb: true,
-            exposure: true,
-            axes: true,
-            crop: true,
-            noise: true,
-        },
+        augment: Augment::ALL,
         ..small()
     };
     let normalizer = Normalizer {
-        demodulate: 0.07,
+        albedo_demodulation_epsilon: Some(0.07),
         ..identity()
     };
     let demodulating = PatchSource::new(&config, train_scenes(), layout(), normalizer, 7);
@@ -150,12 +137,12 @@ fn a_demodulated_batch_times_its_modulation_is_the_plain_one() {
     let features = found.features_z.chunks_exact(FEATURES * 64 * 64);
     let textures = features.flat_map(|patch| &patch[TEXTURES * 64 * 64..(TEXTURES + 3) * 64 * 64]);
     let pixels = plain.color_gamma.iter().zip(&found.color_gamma);
-    for (((plain, found), by), texture) in pixels.zip(&modulation).zip(textures) {
+    for (((plain, found), factor), texture) in pixels.zip(&modulation).zip(textures) {
         assert!(
-            (found * by - plain).abs() <= 1e-5 * plain,
-            "{found} {by} {plain}"
+            (found * factor - plain).abs() <= 1e-5 * plain,
+            "{found} {factor} {plain}"
         );
-        assert_eq!(*by, (texture.max(0.0) + 0.07).powf(1.0 / 2.2));
+        assert_eq!(*factor, (texture.max(0.0) + 0.07).powf(1.0 / 2.2));
     }
     assert_eq!(found.features_z, plain.features_z);
     assert_eq!(found.reference_hdr, plain.reference_hdr);
@@ -170,7 +157,7 @@ fn the_cache_stays_in_its_budget_and_decodes_again() {
     }
     let whole = all.usage();
     assert_eq!((whole.scenes, whole.decoded), (10, 10));
-    // Half planes stay half: 18 planes of two bytes, up to three of them of four.
+    // Half planes stay half: 18 planes of two bytes each, up to three of them of four bytes.
     let pixels = 10 * 224 * 224;
     assert!(
         (pixels * 36..=pixels * 42).contains(&whole.bytes),
@@ -215,38 +202,6 @@ fn batches_do_not_depend_on_the_cache() {
 }
 
 #[test]
-fn the_reference_filter_changes_references_and_nothing_else() {
-    let filtering = DataConfig {
-        reference_filter: true,
-        ..small()
-    };
-    let (plain, filtered) = (load(&small(), 0, 3), load(&filtering, 0, 3));
-    for (plain, filtered) in plain.iter().zip(&filtered) {
-        assert_ne!(plain.reference_hdr, filtered.reference_hdr);
-        let reference_hdr = plain.reference_hdr.clone();
-        let same = Batch {
-            reference_hdr,
-            ..filtered.clone()
-        };
-        assert_eq!(plain, &same);
-    }
-}
-
-#[test]
-fn a_denoised_reference_is_not_filtered() {
-    let mut scenes = train_scenes();
-    scenes[1].ref_denoised = Some("some denoiser".to_owned());
-    let references = |filter| {
-        let cache = SceneCache::new(scenes.clone(), layout(), usize::MAX);
-        let cache = cache.with_reference_filter(filter);
-        [0, 1].map(|i| cache.get(i).expect("sound").reference.clone())
-    };
-    let (plain, filtered) = (references(false), references(true));
-    assert_ne!(plain[0], filtered[0]);
-    assert_eq!(plain[1], filtered[1]);
-}
-
-#[test]
 fn threads_that_want_one_scene_decode_it_once() {
     let cache = SceneCache::new(train_scenes(), layout(), usize::MAX);
     std::thread::scope(|scope| {
@@ -258,7 +213,7 @@ fn threads_that_want_one_scene_decode_it_once() {
 }
 
 #[test]
-fn a_file_that_breaks_later_is_an_error_of_next_and_not_a_hang() {
+fn a_file_damaged_later_is_an_error_of_next_and_not_a_hang() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let path = dir.path().join("a.exr");
     write(&path, (64, 64), scene_channels(64, 64));

@@ -1,4 +1,4 @@
-//! The commands as a user runs them: output, exit status, one line on standard error.
+//! Tests the commands as a user runs them: output, exit status, one line on standard error.
 
 mod support;
 
@@ -157,7 +157,7 @@ fn bad_files_end_with_status_1_and_one_line() {
 }
 
 #[test]
-fn inspect_reports_a_bad_file_and_goes_on() {
+fn inspect_reports_a_bad_file_and_continues() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let (bad, good) = (dir.path().join("bad.exr"), dir.path().join("good.exr"));
     fs::write(&bad, "text").expect("writable");

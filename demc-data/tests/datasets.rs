@@ -1,4 +1,4 @@
-//! Manifests, splits and statistics, on the sample and on sets made to be wrong.
+//! Manifests, splits and statistics, on the sample and on defective data sets.
 
 mod support;
 
@@ -15,7 +15,7 @@ fn entry(name: &str, split: &str, base: &str) -> Value {
     json!({ "name": name, "split": split, "base": base, "file": "a.exr", "width": 8, "height": 6 })
 }
 
-/// A data set of one 8x6 file, `a.exr`, that every scene shares.
+/// A data set whose scenes share one 8x6 file, `a.exr`.
 fn dataset(root: &Path, scenes: Vec<Value>) -> Result<Dataset, Error> {
     write(&root.join("a.exr"), (8, 6), scene_channels(8, 6));
     let manifest = json!({ "format": "demc-exr 1", "scenes": scenes, "renderer": "kept" });
@@ -76,7 +76,8 @@ fn validation_holds_out_whole_base_scenes_by_seed() {
     assert_eq!(train.len() + validation.len(), 30);
     assert_eq!(split(0.34, 1), (train, validation));
     assert!((2..12).any(|seed| bases(&split(0.34, seed).1) != bases(&split(0.34, 1).1)));
-    // A small share still is one base scene, a large one leaves one to train on, none is none.
+    // A small share still holds out one base scene, a large share leaves one for training, and 0
+    // holds out none.
     assert_eq!(bases(&split(0.01, 1).1).len(), 1);
     assert_eq!(bases(&split(0.99, 1).0).len(), 1);
     assert!(split(0.0, 1).1.is_empty());
@@ -161,11 +162,14 @@ fn channels_that_many_scenes_lack_are_listed_once() {
         .expect_err("its texture is albedo1")
         .to_string();
     assert_eq!(message.matches("the file has").count(), 1, "{message}");
-    assert!(message.ends_with("(and so in 9 more scenes)"), "{message}");
+    assert!(
+        message.ends_with("(the same in 9 more scenes)"),
+        "{message}"
+    );
 }
 
 #[test]
-fn a_set_without_masks_is_measured_over_every_pixel() {
+fn a_data_set_without_masks_is_measured_over_every_pixel() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let layout = ChannelLayout::resolve("mitsuba3").expect("a preset");
     dataset(dir.path(), vec![entry("a", "train", "a")]).expect("sound");
@@ -176,13 +180,13 @@ fn a_set_without_masks_is_measured_over_every_pixel() {
     }
     write(&dir.path().join("a.exr"), (8, 6), channels.clone());
     let set = Dataset::open(dir.path(), &layout).expect("all that training needs");
-    let stats = Statistics::measure(&set.scenes, &layout, 2.2, 0.0).expect("sound");
+    let stats = Statistics::measure(&set.scenes, &layout, 2.2, None, 0.001).expect("sound");
     assert_eq!((stats.pixels, stats.misses), (48, 0));
     // Position is channel 6 of the file, stored as float: 6 + i / 48 at pixel i.
     let mean = stats.normalizer.features.mean;
     assert!((mean[3] - (6.0 + 23.5 / 48.0)).abs() < 1e-5, "{mean:?}");
     assert_eq!(mean[6..9], mean[9..]);
-    // To denoise, no reference is needed; to train, it is.
+    // Training needs a reference; denoising does not.
     channels.retain(|(name, _)| !name.starts_with("ref."));
     write(&dir.path().join("a.exr"), (8, 6), channels);
     let frame = read_frame(&dir.path().join("a.exr"), &layout).expect("features are there");
@@ -231,7 +235,8 @@ fn statistics_are_the_same_on_any_number_of_threads() {
         .and_then(|set| set.split(Split::Train))
         .expect("the sample");
     let measure = |threads| {
-        Statistics::measure_on(threads, &scenes, &layout(), 2.2, 0.0).expect("the sample is sound")
+        Statistics::measure_on(threads, &scenes, &layout(), 2.2, None, 0.001)
+            .expect("the sample is sound")
     };
     let one = measure(1);
     assert_eq!(one, measure(3));
@@ -245,7 +250,8 @@ fn statistics_normalise_the_scenes_they_were_measured_on() {
     let scenes = Dataset::open(&sample(), &layout())
         .and_then(|set| set.split(Split::Train))
         .expect("the sample");
-    let stats = Statistics::measure(&scenes, &layout(), 2.2, 0.0).expect("the sample is sound");
+    let stats =
+        Statistics::measure(&scenes, &layout(), 2.2, None, 0.001).expect("the sample is sound");
     let mut sums = [[0.0f64; 2]; 12];
     let mut count = 0.0;
     for scene in &scenes {
@@ -302,7 +308,7 @@ fn statistics_normalise_the_scenes_they_were_measured_on() {
 fn misses_count_for_textures_and_not_for_geometry_and_constants_keep_a_floor() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let set = dataset(dir.path(), vec![entry("a", "train", "a")]).expect("sound");
-    // 48 pixels; the upper half is missed. normal.X is 0 there and 2 on hits, albedo1.R the same.
+    // 48 pixels; the upper half are misses. normal.X is 0 there and 2 at hits, like albedo1.R.
     let upper =
         |missed: f32, hit: f32| half((0..48).map(move |i| if i < 24 { missed } else { hit }));
     let mut channels = scene_channels(8, 6);
@@ -315,7 +321,7 @@ fn misses_count_for_textures_and_not_for_geometry_and_constants_keep_a_floor() {
         }
     }
     write(&dir.path().join("a.exr"), (8, 6), channels);
-    let stats = Statistics::measure(&set.scenes, &layout(), 2.2, 0.0).expect("sound");
+    let stats = Statistics::measure(&set.scenes, &layout(), 2.2, None, 0.001).expect("sound");
     assert_eq!((stats.pixels, stats.misses, stats.clamped), (48, 24, 24));
     let features = stats.normalizer.features;
     assert_eq!((features.mean[0], features.std[0]), (2.0, STD_FLOOR));

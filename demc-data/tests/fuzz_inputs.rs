@@ -1,4 +1,5 @@
-//! The inputs of `fuzz/`: its seeds are files of every kind, its findings are files that once did harm.
+//! The inputs in `fuzz/`: seeds are files of every kind; findings are files that once caused a
+//! failure.
 
 mod support;
 
@@ -11,18 +12,18 @@ use exr::meta::attribute::{LevelMode, SampleType};
 use support::files::{header, scene_kinds, tiled, write_file};
 use support::layout;
 
-fn inputs(of: &str) -> Vec<PathBuf> {
+fn inputs(target: &str) -> Vec<PathBuf> {
     let dir = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../fuzz")
-        .join(of);
+        .join(target);
     let files = fs::read_dir(&dir).unwrap_or_else(|error| panic!("{}: {error}", dir.display()));
     let mut files: Vec<_> = files.map(|file| file.expect("readable").path()).collect();
     files.sort();
     files
 }
 
-/// The seeds of the EXR targets, the smallest files of each kind. To write them again:
-/// `cargo test --release -p demc-data --test fuzz_inputs -- --ignored`.
+/// The seeds of the EXR targets, the smallest files of each kind. To write them again, run `cargo
+/// test --release -p demc-data --test fuzz_inputs -- --ignored`.
 #[test]
 #[ignore = "writes into fuzz/seeds"]
 fn write_seeds() {
@@ -45,7 +46,7 @@ fn write_seeds() {
         let size = match name {
             // More than one block of 16 lines.
             "zip" => (6, 20),
-            // Blocks that get smaller: others are stored as they are.
+            // Compressible blocks; other blocks are stored uncompressed.
             "piz" | "dwaa" | "dwab" => (24, 12),
             _ => (6, 5),
         };
@@ -88,7 +89,7 @@ fn every_seed_of_a_file_reads() {
 }
 
 #[test]
-fn every_finding_in_a_file_is_one_line_now() {
+fn every_finding_in_a_file_gives_one_error_line() {
     for path in inputs("findings/exr") {
         if let Err(error) = read_frame(&path, &layout()) {
             let message = error.to_string();
@@ -99,7 +100,7 @@ fn every_finding_in_a_file_is_one_line_now() {
 }
 
 #[test]
-fn every_finding_in_a_layout_is_a_layout_or_one_line_now() {
+fn every_finding_in_a_layout_is_valid_or_gives_one_error_line() {
     for path in inputs("findings/layout") {
         let bytes = fs::read(&path).expect("readable");
         if let Err(error) = ChannelLayout::from_toml("x.toml", &String::from_utf8_lossy(&bytes)) {

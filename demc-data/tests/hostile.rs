@@ -1,5 +1,5 @@
-//! Files that promise more than they hold, files of kinds that are not read, and paths that are no files: refused in one
-//! line, at once and without the memory that they ask for.
+//! Files that claim more than they hold, unsupported files, and paths that are not files. Each is
+//! refused with one line, at once, and without the claimed memory.
 
 mod support;
 
@@ -19,7 +19,7 @@ use support::layout;
 
 const SIZE: (usize, usize) = (37, 21);
 
-/// What a file with these bytes is refused with, without its name.
+/// The error for a file with these bytes, without its name.
 fn refusal(bytes: &[u8]) -> String {
     let path = Path::new("x.exr");
     let read = ExrFile::parse(path, Cursor::new(bytes)).and_then(|mut file| {
@@ -43,16 +43,16 @@ fn bytes_of(headers: Vec<exr::meta::header::Header>) -> Vec<u8> {
     fs::read(&path).expect("just written")
 }
 
-/// Replaces bytes that must be there.
+/// Replaces bytes, which must be present.
 fn replaced(bytes: &[u8], old: &[u8], new: &[u8]) -> Vec<u8> {
-    let at = bytes
+    let start = bytes
         .windows(old.len())
         .position(|window| window == old)
         .expect("it is there");
-    [&bytes[..at], new, &bytes[at + old.len()..]].concat()
+    [&bytes[..start], new, &bytes[start + old.len()..]].concat()
 }
 
-/// The value of a data window, as stored.
+/// The stored value of a data window.
 fn window(x: (i32, i32), y: (i32, i32)) -> Vec<u8> {
     let attribute = b"dataWindow\0box2i\0\x10\0\0\0".to_vec();
     let sides = [x.0, y.0, x.1, y.1].into_iter().flat_map(i32::to_le_bytes);
@@ -79,7 +79,7 @@ fn files_cut_short_at_every_byte_are_refused() {
 }
 
 #[test]
-fn of_an_image_with_smaller_levels_the_full_size_is_read() {
+fn the_full_size_of_an_image_with_smaller_levels_is_read() {
     for levels in [LevelMode::MipMap, LevelMode::RipMap] {
         for rounding in [RoundingMode::Down, RoundingMode::Up] {
             let part = tiled(
@@ -159,7 +159,7 @@ fn kinds_that_are_not_read_are_named_with_those_that_are() {
     let newer = replaced(&flat, b"v/1\x01\x02", b"v/1\x01\x03");
     assert!(refusal(&newer).contains("file versions other than 2.0"));
 
-    // A block of one byte less than if it were stored as it is.
+    // A block that is one byte shorter than uncompressed.
     let flat = bytes_of(vec![header(None, (4, 4), rgb_kinds(), Method::PIZ)]);
     let wavelets = replaced(
         &flat,
@@ -177,7 +177,7 @@ fn kinds_that_are_not_read_are_named_with_those_that_are() {
 #[test]
 fn sizes_that_no_image_has_are_refused() {
     let flat = bytes_of(vec![header(None, (4, 4), rgb_kinds(), Method::ZIP1)]);
-    // A file of one part may leave the count out.
+    // The block count is optional in a file of one part.
     let flat = replaced(&flat, b"chunkCount\0int\0\x04\0\0\0\x04\0\0\0", b"");
     let own = window((0, 3), (0, 3));
     for (x, y, part) in [
@@ -202,9 +202,9 @@ fn sizes_that_no_image_has_are_refused() {
             (0, 3),
             "window size exceeding integer maximum",
         ),
-        // The largest that is allowed, of more blocks than there are bytes.
+        // The largest allowed size, with more blocks than bytes.
         ((0, 32767), (0, 4095), "it is cut short: "),
-        // Nothing at all.
+        // An empty size.
         ((0, -1), (0, -1), ""),
     ] {
         let message = refusal(&replaced(&flat, &own, &window(x, y)));
@@ -267,14 +267,14 @@ fn paths_of_every_spelling_lead_to_the_file() {
     assert_eq!(error, format!("cannot read {}", missing.display()));
 }
 
-/// A block is not longer than its pixels, so that blocks which lie over each other, here one in each number of the next, take
-/// no more memory than the image.
+/// A block must not be longer than its pixels. Otherwise overlapping blocks, here one inside each
+/// number of the next, would need more memory than the image.
 #[test]
 fn blocks_longer_than_their_pixels_are_refused() {
     let lines = 64;
     let part = header(None, (1, lines), rgb_kinds(), Method::Uncompressed);
     let mut bytes = bytes_of(vec![part]);
-    // Each line: its place, its size, three samples.
+    // Each line has its position, its size and three samples.
     let first = bytes.len() - lines * (4 + 4 + 6);
     for (line, block) in bytes[first..].chunks_exact_mut(14).enumerate() {
         let rest = ((lines - line) * 14 - 8) as u32;
@@ -286,14 +286,15 @@ fn blocks_longer_than_their_pixels_are_refused() {
     );
 }
 
-/// A header of a large image with a full table of blocks, every entry of which leads to the same small one.
+/// A header of a large image with a full table of blocks, in which every entry points to the same
+/// small block.
 fn bomb(size: (usize, usize), method: Method, tiles: bool) -> Vec<u8> {
     let mut part = header(None, (1, 1), rgb_kinds(), method);
     if tiles {
         part = tiled(part, LevelMode::Singular, RoundingMode::Down);
     }
     let small = bytes_of(vec![part.clone()]);
-    // Place and size come before six bytes of samples.
+    // Position and size precede six bytes of samples.
     let block = &small[small.len() - 6 - if tiles { 20 } else { 8 }..];
     let layer_size = size.into();
     let part = exr::meta::header::Header { layer_size, ..part };
@@ -312,7 +313,7 @@ fn bomb(size: (usize, usize), method: Method, tiles: bool) -> Vec<u8> {
 fn a_small_file_takes_little_memory_whatever_it_promises() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let path = dir.path().join("bomb.exr");
-    // In 256 MiB, beside which an image of the largest size has 805 MB.
+    // The limit is 256 MiB; an image of the largest size has 805 MB.
     let inspect = |bytes: &[u8]| -> Output {
         fs::write(&path, bytes).expect("writable");
         let mut shell = Command::new("sh");
@@ -354,7 +355,7 @@ fn a_small_file_takes_little_memory_whatever_it_promises() {
     }
     refused(&bomb(largest, Method::ZIP16, false), "cannot hold");
 
-    // One tile, and a block that is 2 GB by its own words.
+    // One tile, with a block that claims 2 GB.
     let tile = bytes_of(vec![tiled(
         header(
             None,

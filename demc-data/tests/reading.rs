@@ -1,4 +1,4 @@
-//! EXR files of every kind that is read.
+//! Reads EXR files of every supported kind.
 
 mod support;
 
@@ -25,7 +25,7 @@ fn the_sample_reads_whole_and_finite() {
     assert_eq!(frame.reference.map(|r| r.len()), Some(3 * 224 * 224));
     let mask = frame.mask.expect("the sample has masks");
     assert!(mask.iter().all(|share| (0.0..=1.0).contains(share)));
-    // The mean luminance that the renders are scaled to is about 0.2 (data/sample/manifest.json).
+    // The renders are scaled to a mean luminance of about 0.2 (data/sample/manifest.json).
     let mean = frame.color.iter().sum::<f32>() / frame.color.len() as f32;
     assert!((0.02..2.0).contains(&mean), "{mean}");
 }
@@ -110,7 +110,7 @@ fn tiles_and_every_compression_read_the_same() {
 fn channels_of_a_layer_are_addressed_by_its_name() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let path = dir.path().join("layers.exr");
-    // As `demc-exr` names them, but each buffer in a part of its own.
+    // Named as in `demc-exr`, with each buffer in its own part.
     let parts = ["normal", "position", "albedo1", "albedo2", "ref", "mask"].map(|name| {
         let prefix = format!("{name}.");
         let channels = scene_channels(SIZE.0, SIZE.1).into_iter();
@@ -161,7 +161,7 @@ fn a_missing_buffer_follows_the_stated_policy() {
     assert!(features[9 * PIXELS..].iter().all(|&sample| sample == 0.0));
     assert_eq!(features[8 * PIXELS], 11.0);
 
-    // A part of a buffer is a mistake, not a missing buffer.
+    // A partly present buffer is a mistake, not a missing buffer.
     write(&path, SIZE, keep(&["albedo2.G"]));
     assert!(
         matches!(read_frame(&path, &layout), Err(Error::MissingChannels { missing, .. }) if missing == ["albedo2.G"])

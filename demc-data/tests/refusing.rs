@@ -1,4 +1,4 @@
-//! Files that are refused: each message names the file and what is wrong, in one line.
+//! Files that are refused: each message names the file and the problem, in one line.
 
 mod support;
 
@@ -24,7 +24,7 @@ fn refusal(path: &Path) -> String {
     message
 }
 
-/// A file of the `demc-exr` layout with one channel changed.
+/// A file of the `demc-exr` layout with one modified channel.
 fn changed(path: &Path, channel: &str, change: impl FnOnce(&mut FlatSamples)) {
     let mut channels = scene_channels(SIZE.0, SIZE.1);
     let (_, samples) = channels
@@ -89,7 +89,7 @@ fn damaged_bytes_never_end_the_program() {
                 bytes[place] = rng.random();
             }
             fs::write(&path, &bytes).expect("writable");
-            // Some damage is invisible; what matters is to come back.
+            // Some damage has no effect; the program must only not end.
             refused += usize::from(read_frame(&path, &layout()).is_err());
         }
     }
@@ -131,7 +131,7 @@ fn missing_channels_are_named_with_those_present() {
 fn a_missing_channel_that_is_asked_for_twice_is_named_once() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let path = dir.path().join("a.exr");
-    // Its texture is the second one's too.
+    // The second texture copies it, too.
     let layout = ChannelLayout::resolve("mitsuba3").expect("a preset");
     write(&path, SIZE, scene_channels(SIZE.0, SIZE.1));
     let message = read_frame(&path, &layout)

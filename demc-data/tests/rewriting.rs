@@ -1,4 +1,4 @@
-//! Denoised images in the layout of their input: nothing changes but the colour.
+//! Denoised images in the layout of their input: only the colour changes.
 
 mod support;
 
@@ -57,9 +57,10 @@ fn every_compression_and_block_shape_is_carried_over() {
     }
 }
 
-/// Of an image that is several batches on one thread and one on many, in blocks of other sizes than its output's too.
+/// The image has several batches on one thread and one batch on many. Its blocks also differ in
+/// size from the output's.
 #[test]
-fn threads_and_what_was_kept_while_reading_change_nothing() {
+fn threads_and_cached_blocks_do_not_change_the_output() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let (input, output) = (dir.path().join("in.exr"), dir.path().join("out.exr"));
     let size = (700, 400);
@@ -94,7 +95,7 @@ fn threads_and_what_was_kept_while_reading_change_nothing() {
         };
         assert_carried(&input, &output, "one thread");
         for threads in [1, 3, 100] {
-            // None, some of the blocks, all.
+            // Memory for no blocks, for some, and for all.
             for room in [0, 5_000_000, usize::MAX] {
                 let mut file = open(threads).keeping(&layout, room);
                 // Twice from one file, which is read again.
@@ -196,7 +197,7 @@ fn parts_windows_and_attributes_are_the_inputs() {
         let replaced = named.color.contains(&channel.name);
         assert_eq!(old == new, !replaced, "{}", channel.name);
     }
-    // Its own blocks, smaller levels and all: nothing of a part without colour was decoded.
+    // Its blocks are copied, including smaller levels: nothing of a part without colour is decoded.
     for part in [0, 2, 3] {
         assert!(blocks(&input, part) == blocks(&output, part));
     }
@@ -232,7 +233,7 @@ fn equal_images_give_equal_bytes() {
     }
 }
 
-/// The blocks of a part as they are stored.
+/// The stored blocks of a part.
 fn blocks(path: &Path, part: usize) -> Vec<String> {
     let file = BufReader::new(File::open(path).expect("readable"));
     let chunks = exr::block::read(file, false).and_then(|file| file.all_chunks(false));
@@ -244,7 +245,7 @@ fn blocks(path: &Path, part: usize) -> Vec<String> {
 }
 
 #[test]
-fn smaller_levels_of_the_colour_are_left_out_and_said() {
+fn smaller_levels_of_the_colour_are_dropped_and_reported() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let (input, output) = (dir.path().join("in.exr"), dir.path().join("out.exr"));
     for levels in [LevelMode::MipMap, LevelMode::RipMap] {

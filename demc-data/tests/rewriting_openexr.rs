@@ -1,7 +1,5 @@
-//! Rewritten files by the eyes of OpenEXR's own library.
-//!
-//! Needs a Python with the package `OpenEXR` (3.3 or later), named by `DEMC_PYTHON`. Without one the test says that it
-//! was skipped; with `DEMC_REQUIRE_OPENEXR=1` it fails.
+//! Checks rewritten files with OpenEXR's own library.
+//! Without it, the test reports that it is skipped; with `DEMC_REQUIRE_OPENEXR=1` it fails.
 
 mod support;
 
@@ -9,9 +7,9 @@ use std::io::Write;
 use std::path::Path;
 use std::process::Command;
 
-use demc_data::{ChannelLayout, Compression, Keep, WriteOptions, write_denoised};
+use demc_data::{ChannelLayout, Compression, OutputChannels, WriteOptions, write_denoised};
 
-/// Writes the input, as other programs do, and checks the output against it.
+/// Writes the input as other programs do, and checks the output against it.
 const SCRIPT: &str = include_str!("support/openexr.py");
 const PIXELS: usize = 48 * 40;
 
@@ -37,7 +35,7 @@ fn openexr_finds_the_input_with_another_colour() {
             std::env::var("DEMC_REQUIRE_OPENEXR").as_deref() != Ok("1"),
             "DEMC_REQUIRE_OPENEXR=1, but {reason}"
         );
-        // Not `println!`, which the test harness swallows.
+        // Not `println!`, because the test harness captures it.
         writeln!(std::io::stderr(), "skipped: {reason}").expect("stderr can be written");
         return;
     }
@@ -52,7 +50,7 @@ fn openexr_finds_the_input_with_another_colour() {
         let checked = python(&["compare", kind, &text(&input), &text(&output)]);
         checked.unwrap_or_else(|error| panic!("{what}: {error}"));
     };
-    // Lossless ones, and those that are replaced.
+    // Lossless compressions, and compressions that are replaced.
     for compression in [
         "NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB",
     ] {
@@ -70,7 +68,7 @@ fn openexr_finds_the_input_with_another_colour() {
         .for_each(|name| *name = format!("rgba.{name}"));
     denoise(&named, &WriteOptions::default());
     check("all", "parts");
-    let channels = Keep::Color;
+    let channels = OutputChannels::Color;
     denoise(
         &named,
         &WriteOptions {
@@ -79,7 +77,7 @@ fn openexr_finds_the_input_with_another_colour() {
         },
     );
     check("color", "colour only");
-    // Of what this crate compresses with loss, the colour is near.
+    // After lossy compression by this crate, the colour is close.
     python(&["write", "scanlines", &text(&input), "ZIP"]).expect("a file");
     for lossy in [
         Compression::Pxr24,

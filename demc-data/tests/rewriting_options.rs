@@ -1,4 +1,4 @@
-//! Denoised images by the options of their writer, and what stands in the way of writing them.
+//! Denoised images with every option of the writer, and errors of writing.
 
 mod support;
 
@@ -8,8 +8,8 @@ use std::process::Command;
 use demc_data::exr::ExrFile;
 use demc_data::plane::Plane;
 use demc_data::{
-    Change, ChannelLayout, Compression, Error, Keep, Precision, WriteOptions, Written,
-    write_denoised,
+    Change, ChannelLayout, Compression, Error, OutputChannels, SamplePrecision, WriteOptions,
+    Written, write_denoised,
 };
 use exr::meta::header::Header;
 use exr::prelude::{Compression as Method, SampleType, Text};
@@ -41,7 +41,7 @@ fn only_colour_and_its_alpha_stay_on_request() {
         .iter_mut()
         .for_each(|name| *name = format!("main.{name}"));
     let options = WriteOptions {
-        channels: Keep::Color,
+        channels: OutputChannels::Color,
         ..WriteOptions::default()
     };
     write_denoised(&input, &named, &color(PIXELS), &output, &options).expect("sound");
@@ -55,7 +55,7 @@ fn only_colour_and_its_alpha_stay_on_request() {
     let before = planes(&input);
     let alpha = before.iter().find(|(channel, _)| channel.name == "main.A");
     assert!(alpha.expect("written before").1 == after[0].1);
-    // One part of two, with everything else that it had.
+    // One of two parts, with all its other properties.
     let (before, after) = (&headers(&input)[1], &headers(&output)[0]);
     let channels = after.channels.clone();
     assert_eq!(
@@ -68,7 +68,7 @@ fn only_colour_and_its_alpha_stay_on_request() {
 }
 
 #[test]
-fn the_chosen_precision_wins_and_what_half_cannot_hold_is_counted() {
+fn the_chosen_precision_is_used_and_clamped_samples_are_counted() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let (input, output) = (dir.path().join("in.exr"), dir.path().join("out.exr"));
     let mut bright = color(PIXELS);
@@ -77,8 +77,16 @@ fn the_chosen_precision_wins_and_what_half_cannot_hold_is_counted() {
         (SampleType::F16, None, SampleType::F16),
         (SampleType::F32, None, SampleType::F32),
         (SampleType::U32, None, SampleType::F32),
-        (SampleType::F32, Some(Precision::Half), SampleType::F16),
-        (SampleType::F16, Some(Precision::Float), SampleType::F32),
+        (
+            SampleType::F32,
+            Some(SamplePrecision::Half),
+            SampleType::F16,
+        ),
+        (
+            SampleType::F16,
+            Some(SamplePrecision::Float),
+            SampleType::F32,
+        ),
     ];
     for (before, precision, after) in kinds {
         let mut kinds = scene_kinds();
@@ -115,7 +123,7 @@ fn the_chosen_precision_wins_and_what_half_cannot_hold_is_counted() {
 }
 
 #[test]
-fn a_chosen_compression_is_taken_and_its_losses_are_said() {
+fn a_chosen_compression_is_used_and_its_losses_are_reported() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let (input, output) = (dir.path().join("in.exr"), dir.path().join("out.exr"));
     write_file(
@@ -134,7 +142,7 @@ fn a_chosen_compression_is_taken_and_its_losses_are_said() {
             assert_eq!(written.changes, [Change::Lossy { part, to }]);
             assert_eq!(
                 written.changes[0].to_string(),
-                format!("part main: compressed with {to}, which changes the other channels too")
+                format!("part main: compressed with {to}, which also changes the other channels")
             );
         } else {
             assert_eq!(written, Written::default());
@@ -144,7 +152,7 @@ fn a_chosen_compression_is_taken_and_its_losses_are_said() {
 }
 
 #[test]
-fn an_input_that_cannot_be_carried_over_is_named_and_the_output_left_alone() {
+fn an_unusable_input_is_named_and_the_output_stays_unchanged() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let (input, output) = (dir.path().join("in.exr"), dir.path().join("out.exr"));
     fs::write(&output, "old").expect("writable");
@@ -163,7 +171,7 @@ fn an_input_that_cannot_be_carried_over_is_named_and_the_output_left_alone() {
     };
 
     let error = denoise(&layout(), 12);
-    assert!(name(&error).ends_with("36 samples of colour do not fit into 37x45, its size now"));
+    assert!(name(&error).ends_with("36 samples of colour do not match 37x45, its current size"));
     let mut other = layout();
     other.color[1] = "beauty.G".to_owned();
     assert!(name(&denoise(&other, PIXELS)).starts_with("IN: no channel beauty.G; the file has B,"));
@@ -195,11 +203,11 @@ fn an_input_may_be_its_own_output() {
     assert_carried(&copy, &input, "in place");
 }
 
-/// Runs itself on a disk of so many KiB.
+/// Runs this test on a disk of this many KiB.
 const SCRIPT: &str = r#"mount -t tmpfs -o size="${SIZE}k" tmpfs "$DISK" || exit 99
 "$SELF" --exact --ignored --nocapture writes_until_the_disk_is_full"#;
 
-/// A shell with mounts of its own.
+/// A shell with its own mounts.
 #[cfg(target_os = "linux")]
 fn shell(script: &str) -> Command {
     let own = fs::metadata("/proc/self").map(|own| std::os::unix::fs::MetadataExt::uid(&own));

@@ -1,16 +1,16 @@
-//! Finished images of other programs.
+//! Finished images from other programs.
 
 mod support;
 
 use demc_data::rgb::read_rgb;
-use demc_data::{Error, Precision, write_rgb};
+use demc_data::{Error, SamplePrecision, write_rgb};
 
 #[test]
-fn what_was_written_is_read_and_negative_values_are_clamped() {
+fn written_images_read_back_and_negative_values_are_clamped() {
     let dir = tempfile::tempdir().expect("directory");
     let path = dir.path().join("a.exr");
     let planes: Vec<f32> = (0..3 * 6).map(|i| i as f32 - 1.0).collect();
-    write_rgb(&path, 3, 2, &planes, Precision::Half).expect("written");
+    write_rgb(&path, 3, 2, &planes, SamplePrecision::Half).expect("written");
     let image = read_rgb(&path).expect("read");
     assert_eq!((image.width, image.height, image.clamped), (3, 2, 1));
     assert_eq!(image.planes[0], 0.0);
@@ -24,7 +24,7 @@ fn values_that_are_not_finite_are_counted_and_refused() {
     let mut planes = vec![1.0; 3 * 6];
     planes[6 + 4] = f32::NAN;
     planes[6 + 5] = f32::INFINITY;
-    write_rgb(&path, 3, 2, &planes, Precision::Float).expect("written");
+    write_rgb(&path, 3, 2, &planes, SamplePrecision::Float).expect("written");
     match read_rgb(&path) {
         Err(Error::NonFinite {
             channel,
@@ -38,7 +38,7 @@ fn values_that_are_not_finite_are_counted_and_refused() {
 }
 
 #[test]
-fn the_only_layer_with_colours_is_found_and_two_are_not_chosen_from() {
+fn a_single_layer_with_colour_is_found_and_two_are_refused() {
     let dir = tempfile::tempdir().expect("directory");
     let path = dir.path().join("a.exr");
     let value = |x: f32| support::half([x; 4]);

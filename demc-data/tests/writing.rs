@@ -1,11 +1,11 @@
-//! Images out: what is written, and that it is whole or not there.
+//! Written images: their content, and that they are complete or absent.
 
 use std::fs;
 use std::path::Path;
 
 use demc_data::exr::ExrFile;
 use demc_data::plane::Plane;
-use demc_data::{Error, Precision, write_rgb};
+use demc_data::{Error, SamplePrecision, write_rgb};
 
 const SIZE: (usize, usize) = (7, 5);
 const PIXELS: usize = 35;
@@ -15,7 +15,7 @@ fn written_images_read_back_as_r_g_b() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let path = dir.path().join("out.exr");
     let rgb: Vec<f32> = (0..3 * PIXELS).map(|i| i as f32 * 0.37).collect();
-    write_rgb(&path, SIZE.0, SIZE.1, &rgb, Precision::Float).expect("writable");
+    write_rgb(&path, SIZE.0, SIZE.1, &rgb, SamplePrecision::Float).expect("writable");
     let read = |path: &Path| -> Vec<f32> {
         let mut file = ExrFile::open(path).expect("just written");
         assert_eq!(
@@ -34,9 +34,10 @@ fn written_images_read_back_as_r_g_b() {
     assert_eq!(read(&path), rgb);
 
     let bright: Vec<f32> = rgb.iter().map(|value| value * 5000.0).collect();
-    write_rgb(&path, SIZE.0, SIZE.1, &bright, Precision::Half).expect("writable over the old one");
+    write_rgb(&path, SIZE.0, SIZE.1, &bright, SamplePrecision::Half)
+        .expect("writable over the old one");
     for (read, written) in read(&path).into_iter().zip(bright) {
-        // Half has 11 bits; what is too bright for it becomes its largest value, not infinity.
+        // Half has 11 bits; brighter values become its largest value, not infinity.
         let written = written.min(65504.0);
         assert!(
             (read - written).abs() <= written / 2048.0,
@@ -56,7 +57,7 @@ fn outputs_can_be_read_by_everyone() {
     use std::os::unix::fs::PermissionsExt;
     let dir = tempfile::tempdir().expect("a temporary directory");
     let path = dir.path().join("out.exr");
-    write_rgb(&path, 1, 1, &[1.0; 3], Precision::Half).expect("writable");
+    write_rgb(&path, 1, 1, &[1.0; 3], SamplePrecision::Half).expect("writable");
     assert_eq!(
         fs::metadata(&path)
             .expect("just written")
@@ -72,15 +73,15 @@ fn an_output_that_cannot_be_written_is_named_and_leaves_nothing() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let nowhere = dir.path().join("missing/out.exr");
     let error =
-        write_rgb(&nowhere, 1, 1, &[1.0; 3], Precision::Half).expect_err("no such directory");
+        write_rgb(&nowhere, 1, 1, &[1.0; 3], SamplePrecision::Half).expect_err("no such directory");
     assert_eq!(
         error.to_string(),
         format!("cannot write {}", nowhere.display())
     );
-    // A directory is in the way.
+    // A directory has this name.
     let taken = dir.path().join("taken.exr");
     fs::create_dir_all(taken.join("in use")).expect("writable");
-    write_rgb(&taken, 1, 1, &[1.0; 3], Precision::Half).expect_err("it is a directory");
+    write_rgb(&taken, 1, 1, &[1.0; 3], SamplePrecision::Half).expect_err("it is a directory");
     assert_eq!(
         fs::read_dir(dir.path()).expect("readable").count(),
         1,
@@ -95,17 +96,18 @@ fn a_link_stays_and_the_file_it_leads_to_is_replaced() {
     let (file, link) = (dir.path().join("out.exr"), dir.path().join("latest.exr"));
     fs::write(&file, "old").expect("writable");
     std::os::unix::fs::symlink("out.exr", &link).expect("writable");
-    write_rgb(&link, 1, 1, &[1.0; 3], Precision::Half).expect("writable through the link");
+    write_rgb(&link, 1, 1, &[1.0; 3], SamplePrecision::Half).expect("writable through the link");
     assert!(link.is_symlink() && !file.is_symlink());
     ExrFile::open(&file).expect("just written");
     fs::remove_file(&file).expect("it is there");
-    let error = write_rgb(&link, 1, 1, &[1.0; 3], Precision::Half).expect_err("a link to nothing");
+    let error =
+        write_rgb(&link, 1, 1, &[1.0; 3], SamplePrecision::Half).expect_err("a link to nothing");
     assert!(link.is_symlink(), "{error}");
 }
 
 #[cfg(unix)]
 #[test]
-fn what_is_not_a_regular_file_is_refused_and_left_alone() {
+fn special_files_are_refused_and_stay_unchanged() {
     use std::os::unix::fs::{FileTypeExt, symlink};
     // A FIFO stands in for a device: a test must not touch real ones.
     let dir = tempfile::tempdir().expect("a temporary directory");
@@ -114,7 +116,7 @@ fn what_is_not_a_regular_file_is_refused_and_left_alone() {
     assert!(made.expect("mkfifo is there").success());
     symlink(&fifo, &link).expect("writable");
     for path in [&fifo, &link, &dir.path().to_owned()] {
-        let error = write_rgb(path, 1, 1, &[1.0; 3], Precision::Half).expect_err("no file");
+        let error = write_rgb(path, 1, 1, &[1.0; 3], SamplePrecision::Half).expect_err("no file");
         assert_eq!(
             error.to_string(),
             format!("cannot write {}", path.display())

@@ -1,11 +1,11 @@
-//! Denoises a frame that is in memory, as a renderer would: a tiled floor and a wall under an area lamp, rendered here at 4 samples
-//! a pixel.
+//! Denoises a frame in memory, as a renderer would. The scene is a tiled floor and a wall under an
+//! area lamp, rendered here at 4 samples per pixel.
 //!
 //! ```sh
 //! cargo run --release -p demc-infer --example frame
 //! ```
 
-use demc_data::{FEATURES, Frame, Precision};
+use demc_data::{FEATURES, Frame, SamplePrecision};
 use demc_infer::{Bundle, Picture, device};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
@@ -13,11 +13,11 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 const WIDTH: usize = 320;
 const HEIGHT: usize = 180;
 const SAMPLES: usize = 4;
-type Vector = [f32; 3];
-/// In metres; y is up, the floor is y = 0, the wall z = 0.
-const CAMERA: Vector = [0.4, 1.6, 4.0];
-/// One corner of the lamp, which is 1 m x 1 m and lies flat.
-const LAMP: Vector = [-0.5, 3.6, 0.9];
+type Vec3 = [f32; 3];
+/// Position of the camera in metres. y is up, the floor is y = 0, the wall is z = 0.
+const CAMERA: Vec3 = [0.4, 1.6, 4.0];
+/// One corner of the lamp, which is horizontal and measures 1 m x 1 m.
+const LAMP: Vec3 = [-0.5, 3.6, 0.9];
 const LAMP_RADIANCE: f32 = 60.0;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -35,13 +35,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         WIDTH,
         HEIGHT,
         &denoised,
-        Precision::Half,
+        SamplePrecision::Half,
     )?;
     println!("frame.exr, and frame.png with the noisy and the denoised image");
     Ok(())
 }
 
-/// Every buffer is the mean over a pixel's samples.
+/// Renders the frame. Every buffer is the mean over a pixel's samples.
 fn render() -> Frame {
     let pixels = WIDTH * HEIGHT;
     let mut rng = ChaCha8Rng::seed_from_u64(1);
@@ -53,14 +53,14 @@ fn render() -> Frame {
             let x = ((pixel % WIDTH) as f32 + random() - WIDTH as f32 / 2.0) / HEIGHT as f32;
             let y = ((pixel / WIDTH) as f32 + random() - HEIGHT as f32 / 2.0) / HEIGHT as f32;
             let (position, normal, texture) = hit([x, -y, -1.0]);
-            // A point of the lamp, and what it sends here.
+            // A random point of the lamp, and its direct light.
             let to = [0.0f32, 0.0, 0.0].map(|_| random());
             let light = [LAMP[0] + to[0], LAMP[1], LAMP[2] + to[2]];
-            let toward: Vector = std::array::from_fn(|i| light[i] - position[i]);
+            let toward: Vec3 = std::array::from_fn(|i| light[i] - position[i]);
             let square = dot(toward, toward);
             let cosines = dot(toward, normal).max(0.0) * toward[1].max(0.0) / square;
             let irradiance = LAMP_RADIANCE * cosines / square;
-            // The second hit: the lamp, which a layout counts as white, or nothing.
+            // The second hit is the lamp, which counts as white, or nothing.
             let second = [f32::from(irradiance > 0.0); 3];
             let planes = [normal, position, texture, second];
             for channel in 0..3 {
@@ -85,8 +85,8 @@ fn render() -> Frame {
     }
 }
 
-/// Position, normal and texture where a ray from the camera ends.
-fn hit(ray: Vector) -> (Vector, Vector, Vector) {
+/// Position, normal and albedo at the first hit of a ray from the camera.
+fn hit(ray: Vec3) -> (Vec3, Vec3, Vec3) {
     let wall = -CAMERA[2] / ray[2];
     let floor = if ray[1] < 0.0 {
         -CAMERA[1] / ray[1]
@@ -95,7 +95,7 @@ fn hit(ray: Vector) -> (Vector, Vector, Vector) {
     };
     let at = |distance: f32| std::array::from_fn(|i| CAMERA[i] + distance * ray[i]);
     if floor < wall {
-        let position: Vector = at(floor);
+        let position: Vec3 = at(floor);
         let dark = (position[0].floor() + position[2].floor()).rem_euclid(2.0) < 0.5;
         let texture = if dark {
             [0.1, 0.12, 0.15]
@@ -108,6 +108,6 @@ fn hit(ray: Vector) -> (Vector, Vector, Vector) {
     }
 }
 
-fn dot(a: Vector, b: Vector) -> f32 {
+fn dot(a: Vec3, b: Vec3) -> f32 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }

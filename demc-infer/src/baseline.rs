@@ -1,4 +1,5 @@
-//! Other programs' images of a data set: a directory with an EXR file for each scene, named as the scene's.
+//! Baselines: other programs' images of a data set, one EXR file per scene with the scene's file
+//! name.
 
 use std::ffi::OsStr;
 use std::path::PathBuf;
@@ -6,15 +7,15 @@ use std::str::FromStr;
 
 use demc_data::{Rgb, Scene, read_rgb};
 
-/// Names that mean something else in a report.
-const TAKEN: [&str; 5] = ["noisy", "black", "denoised", "reference", "mean"];
+/// Names with another meaning in a report.
+const RESERVED: [&str; 5] = ["noisy", "black", "denoised", "reference", "mean"];
 
 /// A directory of images to compare with.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Baseline {
-    /// What reports call it.
+    /// Its name in reports.
     pub name: String,
-    /// Where its images are.
+    /// The directory with its images.
     pub dir: PathBuf,
 }
 
@@ -25,15 +26,15 @@ pub enum BaselineError {
     /// Not `NAME=DIR`.
     #[error("{0:?} is not NAME=DIR")]
     Form(String),
-    /// A name that a report uses for something else, or twice.
-    #[error("{0}: the name of something else in the report")]
+    /// A reserved name, or one that is used twice.
+    #[error("{0}: the name is reserved or used twice")]
     Taken(String),
-    /// Images that are not there.
-    #[error("baseline {name}: no {}", paths.join(", "))]
+    /// Missing images.
+    #[error("baseline {name}: missing {}", paths.join(", "))]
     Missing {
         /// The baseline.
         name: String,
-        /// All files that are missing.
+        /// All missing files.
         paths: Vec<String>,
     },
     /// An image of another size.
@@ -43,10 +44,10 @@ pub enum BaselineError {
         path: PathBuf,
         /// Its size, as `WxH`.
         found: String,
-        /// The scene's.
+        /// The scene's size.
         expected: String,
     },
-    /// An image that cannot be read, or holds NaN or infinite values.
+    /// An image cannot be read, or holds NaN or infinite values.
     #[error(transparent)]
     Read(#[from] demc_data::Error),
 }
@@ -66,7 +67,7 @@ impl FromStr for Baseline {
 }
 
 impl Baseline {
-    /// The image of `scene`.
+    /// Path of the image of `scene`.
     fn path(&self, scene: &Scene) -> PathBuf {
         let stem = scene.path.file_stem().unwrap_or(OsStr::new(&scene.name));
         let mut file = stem.to_owned();
@@ -93,15 +94,16 @@ impl Baseline {
     }
 }
 
-/// Checks before anything is computed that names are free and every image is there.
+/// Checks that names are unique and not reserved, and that every image exists.
 ///
 /// # Errors
-/// [`BaselineError::Taken`], or [`BaselineError::Missing`] with all images that the first such baseline lacks.
+/// [`BaselineError::Taken`], or [`BaselineError::Missing`] with all missing images of the first
+/// such baseline.
 pub fn check(baselines: &[Baseline], scenes: &[Scene]) -> Result<(), BaselineError> {
     for (i, baseline) in baselines.iter().enumerate() {
         let name = &baseline.name;
         let twice = baselines[..i].iter().any(|other| other.name == *name);
-        if twice || TAKEN.contains(&name.as_str()) {
+        if twice || RESERVED.contains(&name.as_str()) {
             return Err(BaselineError::Taken(name.clone()));
         }
     }
@@ -136,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_the_report_are_taken() {
+    fn reserved_and_repeated_names_are_refused() {
         let baseline = |name: &str| format!("{name}=dir").parse::<Baseline>().expect("form");
         for names in [vec!["noisy"], vec!["a", "a"]] {
             let list: Vec<_> = names.into_iter().map(baseline).collect();

@@ -1,18 +1,19 @@
-//! `--ops` and `--isa`: how a device computes, for the commands of both binaries that run a network.
+//! `--ops` and `--isa`: operations and instruction set, for all commands that run a network.
 
 use burn::tensor::Device;
-use clap::Args;
 use demc_model::ops::{self, ISA_VARIABLE, Isa, Ops, UnknownIsa};
 
-/// Flags for how to compute, flattened into a command.
-#[derive(Args, Clone, Copy, Debug)]
+/// Flags for operations and instruction set.
+#[derive(Clone, Copy, Debug)]
+#[cfg_attr(feature = "cli", derive(clap::Args))]
 pub struct ComputeFlags {
-    /// Operations on the CPU device flex: kernels (ours) or burn (Burn's own, slower). Other devices have Burn's
-    #[arg(long, value_name = "OPS", default_value_t)]
+    /// Operations on the CPU device flex: kernels (this project's) or burn (Burn's, slower). Other
+    /// devices use Burn's
+    #[cfg_attr(feature = "cli", arg(long, value_name = "OPS", default_value_t))]
     ops: Ops,
-    /// Instructions of the kernels: avx512, avx2, neon or portable, where the machine has them; auto: as the variable
-    /// DEMC_ISA says, else the best
-    #[arg(long, value_name = "ISA", default_value = "auto")]
+    /// Instruction set of the kernels: avx512, avx2, neon or portable. auto uses the variable
+    /// DEMC_ISA, or the best set of this machine
+    #[cfg_attr(feature = "cli", arg(long, value_name = "ISA", default_value = "auto"))]
     isa: IsaFlag,
 }
 
@@ -31,16 +32,16 @@ impl std::str::FromStr for IsaFlag {
     }
 }
 
-/// The variable `DEMC_ISA` names no instruction path of this machine.
+/// The variable `DEMC_ISA` names no instruction set of this machine.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{ISA_VARIABLE}: {0}")]
 pub struct IsaError(UnknownIsa);
 
 impl ComputeFlags {
-    /// Makes this process compute so. To be called before a network is built.
+    /// Applies the flags to this process. Call it before a network is built.
     ///
     /// # Errors
-    /// Where no path was asked for by flag and the environment's is unknown or not on this machine.
+    /// `--isa` is `auto`, and the variable names a set that is unknown or not on this machine.
     pub fn apply(self) -> Result<(), IsaError> {
         ops::set_default(self.ops);
         match self.isa {
@@ -53,12 +54,12 @@ impl ComputeFlags {
     }
 }
 
-/// What networks that are built now run on `device`, in words.
+/// Describes the operations and instruction set of networks that are now built for `device`.
 pub fn describe(device: &Device) -> String {
     ops::process_default().describe(device)
 }
 
-#[cfg(test)]
+#[cfg(all(test, feature = "cli"))]
 mod tests {
     use super::*;
     use clap::Parser;
@@ -70,15 +71,15 @@ mod tests {
     }
 
     #[test]
-    fn kernels_on_the_best_instructions_are_the_default() {
+    fn kernels_with_the_best_instruction_set_are_the_default() {
         let flags = Program::try_parse_from(["demc"]).expect("defaults").compute;
         assert_eq!((flags.ops, flags.isa.0), (Ops::Kernels, None));
     }
 
     #[test]
-    fn what_does_not_exist_is_a_usage_error_that_lists_what_does() {
+    fn an_unknown_value_is_a_usage_error_that_lists_the_known_ones() {
         for (flags, listed) in [
-            (["demc", "--ops", "cpu"], "kernels, burn"),
+            (["demc", "--ops", "cpu"], "kernels or burn"),
             (["demc", "--isa", "sse9"], "portable"),
         ] {
             let error = Program::try_parse_from(flags).err().expect("unknown");

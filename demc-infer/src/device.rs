@@ -1,33 +1,33 @@
-//! Names of devices to Burn devices: `flex`, `ndarray`, `wgpu[:N]`, `cuda[:N]`.
+//! Turns device names into Burn devices: `flex`, `ndarray`, `wgpu[:N]`, `cuda[:N]`.
 //!
-//! The device is always named, never guessed: Burn's own default depends on which features happen to be compiled
-//! in and on the variable `BURN_DEVICE`. `flex` (Burn's own CPU backend) is in every build; the others are cargo
+//! The user always names the device. Burn's default would depend on the compiled features and on
+//! the variable `BURN_DEVICE`. `flex` (Burn's CPU backend) is in every build; the others are cargo
 //! features of the same name.
 //!
-//! Burn's constructors are lazy and a missing GPU panics at the first tensor, on a thread of the runtime. So
-//! [`parse`] first asks the runtime to list its devices (which does not panic on a machine without a driver), then
-//! computes one sum on the one chosen, with panics caught and their output silenced: a driver without its compiler
-//! (CUDA without NVRTC) is only found out by running something.
+//! Burn's constructors are lazy, and a missing GPU panics at the first tensor, on a thread of the
+//! runtime. So [`parse`] first lists the runtime's devices, which does not panic without a driver.
+//! Then it computes one sum on the chosen device, with panics caught and their output silenced.
+//! Only a computation shows a driver without its compiler (CUDA without NVRTC).
 
 use burn::tensor::Device;
 
-/// The device names that [`parse`] knows, as shown to users.
+/// The device names that [`parse`] accepts, as shown to users.
 pub const KNOWN: &str = "flex, ndarray, wgpu[:N], cuda[:N]";
 
-/// Why a device name gives no device.
+/// Why a device cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum DeviceError {
-    /// The name is none of the known ones.
+    /// The name is unknown.
     #[error("unknown device `{name}`; known devices: {KNOWN}")]
     Unknown {
-        /// What the user wrote.
+        /// The given name.
         name: String,
     },
-    /// The backend exists, but was not compiled in.
+    /// The backend exists, but is not in this build.
     #[error("device `{name}`: not in this build; build with `--features {feature}`")]
     NotBuilt {
-        /// What the user wrote.
+        /// The given name.
         name: String,
         /// The cargo feature that adds it.
         feature: &'static str,
@@ -35,28 +35,28 @@ pub enum DeviceError {
     /// The runtime lists no such device on this machine.
     #[error("device `{name}`: not on this machine, which has {found} such device(s); {hint}")]
     Absent {
-        /// What the user wrote.
+        /// The given name.
         name: String,
-        /// How many devices of this backend there are.
+        /// Number of devices of this backend.
         found: usize,
-        /// What the backend needs.
+        /// The backend's requirements.
         hint: &'static str,
     },
-    /// The device is listed, but a first computation on it failed.
+    /// The device is listed, but a test computation on it failed.
     #[error("device `{name}`: a test computation failed: {reason}")]
     Broken {
-        /// What the user wrote.
+        /// The given name.
         name: String,
-        /// The runtime's words, first line.
+        /// First line of the runtime's error.
         reason: String,
     },
 }
 
 /// The device called `name`: `flex`, `ndarray`, `wgpu`, `wgpu:N`, `cuda` or `cuda:N`.
 ///
-/// `wgpu` without a number is the adapter that the runtime likes best (a discrete GPU before an integrated one
-/// before a software one); `wgpu:N` is the N-th of those listed, from 0. The device is plain: training adds
-/// `.autodiff()`.
+/// `wgpu` without a number is the runtime's preferred adapter: a discrete GPU before an integrated
+/// one, and both before software. `wgpu:N` is the N-th listed adapter, from 0. The device has no
+/// autodiff; training adds it.
 ///
 /// # Errors
 /// Every [`DeviceError`]. Nothing is printed and nothing panics.
@@ -131,7 +131,7 @@ fn not_built(name: &str, feature: &'static str) -> DeviceError {
     }
 }
 
-/// The `index`-th of `listed`, once it has computed something.
+/// Device `index` of `listed`, after a test computation.
 #[cfg(any(feature = "wgpu", feature = "cuda"))]
 fn pick(
     name: &str,
@@ -154,7 +154,8 @@ fn pick(
     }
 }
 
-/// Computes 1 + 1 on `device`. A panic becomes its message: the first one, which is that of the runtime's own thread.
+/// Computes 1 + 1 on `device`. A panic becomes an error with the first panic's message, which is
+/// that of the runtime's thread.
 #[cfg(any(feature = "wgpu", feature = "cuda"))]
 fn probe(device: &Device) -> Result<(), String> {
     use burn::tensor::Tensor;
@@ -223,7 +224,7 @@ mod tests {
 
     #[cfg(any(feature = "wgpu", feature = "cuda"))]
     #[test]
-    fn a_device_that_is_not_there_is_an_error() {
+    fn a_missing_device_is_an_error() {
         for name in ["wgpu:4000", "cuda:4000"] {
             let error = parse(name).expect_err(name);
             assert!(

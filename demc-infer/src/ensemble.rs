@@ -1,8 +1,10 @@
-//! Several looks at an image: mirrored and turned, each denoised for itself, and the mean of what comes out ("geometric
-//! self-ensemble": Lim et al. 2017, "Enhanced Deep Residual Networks for Single Image Super-Resolution", Sec. 3.3).
+//! Test-time augmentation: flipped and transposed copies of an image are denoised separately, and
+//! the results are averaged.
 //!
-//! A network sees a mirrored image as another one and errs in another way; of errors that differ the mean is smaller. It takes
-//! as many passes as there are looks. Normals and positions are those of the world, whichever way the image is held.
+//! Lim et al. 2017, "Enhanced Deep Residual Networks for Single Image Super-Resolution", Sec. 3.3,
+//! call this a geometric self-ensemble. The network makes different errors on each copy, and
+//! averaging reduces them. Each copy takes one pass. Normals and positions are in world space, so
+//! they do not change with the image's orientation.
 
 use std::str::FromStr;
 
@@ -14,20 +16,20 @@ const ROWS: usize = 2;
 /// Axis of the columns.
 const COLUMNS: usize = 3;
 
-/// How many looks at an image.
+/// Number of passes over copies of an image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Ensemble {
-    /// The image as it is.
+    /// The image itself.
     #[default]
     One,
-    /// It and its three mirror images.
+    /// The image and its three flipped copies.
     Four,
-    /// Those and the four with rows as columns.
+    /// Those four, and their transposed copies.
     Eight,
 }
 
 impl Ensemble {
-    /// How many passes through the network that is.
+    /// Number of passes through the network.
     pub fn count(self) -> usize {
         match self {
             Ensemble::One => 1,
@@ -36,28 +38,32 @@ impl Ensemble {
         }
     }
 
-    /// The mean of what `denoise` makes of all looks at `images`.
+    /// Applies `denoise` to every copy of `images` and returns the mean.
     ///
     /// # Shapes
-    /// All images and the mean `[B, channels, H, W]`.
+    /// All images and the mean are `[B, channels, H, W]`.
     pub(crate) fn mean<const N: usize>(
         self,
         images: [Tensor<4>; N],
         denoise: impl Fn([Tensor<4>; N]) -> Tensor<4>,
     ) -> Tensor<4> {
         if self == Ensemble::One {
-            // The network lets go of its images when it can.
+            // No clones: the network frees its inputs early.
             return denoise(images);
         }
-        let looks = (0..self.count()).map(Look);
-        let sum = looks
-            .map(|look| look.back(denoise(images.clone().map(|image| look.at(image)))))
+        let symmetries = (0..self.count()).map(Symmetry);
+        let sum = symmetries
+            .map(|symmetry| {
+                let copies = images.clone().map(|image| symmetry.apply(image));
+                symmetry.undo(denoise(copies))
+            })
             .reduce(|sum, image| sum + image)
-            .expect("there are four looks or eight");
+            .expect("four or eight symmetries");
         sum.div_scalar(self.count() as f32)
     }
 
-    /// Bytes for each pixel that looks take beside a pass: the images once more, the sum, and the last one's output.
+    /// Bytes per pixel that augmentation needs in addition to a pass: the copies of the images, the
+    /// sum, and the latest output.
     pub(crate) fn bytes_per_pixel(self, channels_in: usize, channels_out: usize) -> u64 {
         match self {
             Ensemble::One => 0,
@@ -66,9 +72,9 @@ impl Ensemble {
     }
 }
 
-/// A number of looks that there is no ensemble of.
+/// A number of passes other than 1, 4 and 8.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("there are ensembles of 1, 4 and 8 looks")]
+#[error("the number of passes must be 1, 4 or 8")]
 pub struct UnknownEnsemble;
 
 impl FromStr for Ensemble {
@@ -81,12 +87,13 @@ impl FromStr for Ensemble {
     }
 }
 
-/// One of the eight ways to hold an image: bits for rows turned round, columns turned round, and then one as the other.
+/// One of the eight symmetries of a square. Bit 0 reverses the rows, bit 1 the columns; bit 2 then
+/// transposes.
 #[derive(Clone, Copy, Debug)]
-struct Look(usize);
+struct Symmetry(usize);
 
-impl Look {
-    /// Rows and columns turned round, where the look does.
+impl Symmetry {
+    /// Reverses rows and columns as bits 0 and 1 say.
     fn flip(self, image: Tensor<4>) -> Tensor<4> {
         match self.0 & 3 {
             0 => image,
@@ -96,7 +103,7 @@ impl Look {
         }
     }
 
-    /// Rows as columns, where the look does.
+    /// Transposes if bit 2 is set.
     fn transpose(self, image: Tensor<4>) -> Tensor<4> {
         match self.0 & 4 {
             0 => image,
@@ -104,13 +111,13 @@ impl Look {
         }
     }
 
-    /// The image, held so.
-    fn at(self, image: Tensor<4>) -> Tensor<4> {
+    /// The transformed image.
+    fn apply(self, image: Tensor<4>) -> Tensor<4> {
         self.transpose(self.flip(image))
     }
 
-    /// An image that is held so, as it was.
-    fn back(self, image: Tensor<4>) -> Tensor<4> {
+    /// The inverse of [`apply`](Self::apply).
+    fn undo(self, image: Tensor<4>) -> Tensor<4> {
         self.flip(self.transpose(image))
     }
 }
@@ -120,7 +127,7 @@ mod tests {
     use super::*;
     use burn::tensor::{Device, TensorData};
 
-    /// `[1, 2, 2, 3]`, every value another.
+    /// `[1, 2, 2, 3]` with distinct values.
     fn image() -> Tensor<4> {
         let values: Vec<f32> = (0..12).map(|i| i as f32).collect();
         Tensor::from_data(TensorData::new(values, [1, 2, 2, 3]), &Device::flex())
@@ -131,21 +138,22 @@ mod tests {
     }
 
     #[test]
-    fn every_look_is_another_and_comes_back() {
+    fn symmetries_differ_and_can_be_undone() {
         let mut seen = Vec::new();
-        for look in (0..8).map(Look) {
-            let held = look.at(image());
-            assert_eq!(host(look.back(held.clone())), host(image()), "{look:?}");
-            let held = (held.dims(), host(held));
-            assert!(!seen.contains(&held), "{look:?}");
-            seen.push(held);
+        for symmetry in (0..8).map(Symmetry) {
+            let copy = symmetry.apply(image());
+            let restored = host(symmetry.undo(copy.clone()));
+            assert_eq!(restored, host(image()), "{symmetry:?}");
+            let copy = (copy.dims(), host(copy));
+            assert!(!seen.contains(&copy), "{symmetry:?}");
+            seen.push(copy);
         }
     }
 
-    /// What does the same to every pixel is the same for any number of looks; what adds to the first row alone reaches every border
-    /// of the mean that a look puts there.
+    /// A function that adds 1 to the first row shows up at every border that a symmetry maps to the
+    /// first row.
     #[test]
-    fn the_mean_is_of_all_looks() {
+    fn the_mean_covers_all_symmetries() {
         for (ensemble, borders) in [
             (Ensemble::One, [1.0, 0.0, 0.0]),
             (Ensemble::Four, [0.5, 0.5, 0.0]),

@@ -1,28 +1,34 @@
-//! What a trained network is for: denoising images, scoring them, and moving weights between files.
+//! Uses a trained network: denoises images, scores them, exports and imports weights.
 //!
-//! A renderer links this crate to denoise frames that it has in memory:
+//! A renderer links this crate to denoise frames in memory. Without the default feature `cli`, the
+//! library has no dependency for the command line, JPEG or progress bars.
 //!
 //! ```
 //! use demc_data::Frame;
 //! use demc_infer::{Bundle, device};
 //!
-//! // A run directory, a checkpoint or an exported file: the network with all that its numbers depend on.
+//! // A run directory, a checkpoint or an exported file.
 //! let device = device::parse("flex")?;
 //! let bundle = Bundle::load("../models/demc.safetensors".as_ref(), &device)?;
 //!
-//! // Planar buffers as rendered: linear HDR colour; normal xyz, position xyz in world space, texture RGB at the first and at
-//! // the second hit.
 //! let (width, height) = (64, 48);
+//! // Planar buffers as rendered. Colour is linear HDR.
+//! let color = vec![0.2; 3 * width * height];
+//!
+//! // Normal xyz, position xyz, albedo rgb of the first and of the second hit.
+//! let features = vec![0.5; 12 * width * height];
+//!
 //! let frame = Frame {
 //!     name: "frame 1".into(),
 //!     width,
 //!     height,
-//!     color: vec![0.2; 3 * width * height],
-//!     features: vec![0.5; 12 * width * height],
+//!     color,
+//!     features,
 //!     reference: None,
 //!     mask: None,
 //!     clamped: 0,
 //! };
+//!
 //! for warning in bundle.warnings(&frame)? {
 //!     eprintln!("warning: {warning}");
 //! }
@@ -31,19 +37,21 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! `cargo run --release -p demc-infer --example frame` is a whole program of this kind.
+//! `cargo run --release -p demc-infer --example frame` runs a complete program of this kind.
 //!
-//! - [`bundle`]: a [`Bundle`] is a network together with everything that its numbers depend on: configuration, normalisation
-//!   statistics, channel layout, training step. The one writer and the one reader of its file.
-//! - [`denoise`]: a frame to its denoised image, of any size: over [`padding`] and [`tiles`], within the [`memory`] that is there,
-//!   and as the mean of an [`ensemble`](mod@ensemble) of looks at it where asked for.
-//! - [`guard`]: what is refused and what is warned of, when an image is not what the network was trained on.
-//! - [`onnx`] writes the network for other runtimes, [`verify`](mod@verify) compares what those make of it with what this crate does.
-//! - [`evaluate`]: scores against a reference, beside [`baseline`]s, with [`statistics`]. [`report`]: one page to look at them.
-//!   [`picture`]: images to look at.
-//! - [`device`], [`compute`]: what computes, and how.
+//! - [`bundle`]: a [`Bundle`] is a network with its configuration, normalisation statistics,
+//!   channel layout and training step. This module alone reads and writes its file.
+//! - [`denoise`]: denoises a frame of any size, with [`padding`], [`tiles`] that fit into the
+//!   available [`memory`], and optional test-time augmentation ([`ensemble`](mod@ensemble)).
+//! - [`guard`]: compares an image with the training data, then refuses it or warns.
+//! - [`onnx`]: exports the network for other runtimes. [`verify`](mod@verify) compares their output
+//!   with this crate's.
+//! - [`evaluate`]: scores against a reference, with [`baseline`]s and [`statistics`]. `report`
+//!   (feature `cli`) makes an HTML page of them, [`picture`] makes 8-bit pictures.
+//! - [`device`], [`compute`]: the device, its operations and instruction set.
 //!
-//! Training validates with exactly this code. Nothing here prints or exits; every error names the frame, file or channel.
+//! Training validates with this code. The library never prints or exits. Every error names the
+//! frame, file or channel.
 #![forbid(unsafe_code)]
 
 pub mod baseline;
@@ -52,12 +60,14 @@ pub mod compute;
 pub mod denoise;
 pub mod device;
 pub mod ensemble;
+mod error;
 pub mod evaluate;
 pub mod guard;
 pub mod memory;
 pub mod onnx;
 pub mod padding;
 pub mod picture;
+#[cfg(feature = "cli")]
 pub mod report;
 pub mod statistics;
 pub mod tiles;

@@ -1,8 +1,7 @@
-//! `demc-infer`: what is done with a trained network, a verb a file. See `cli`.
+//! The command line program `demc-infer`. `cli` has one file per verb.
 #![forbid(unsafe_code)]
 
 mod cli;
-mod progress;
 
 use std::process::ExitCode;
 
@@ -17,7 +16,7 @@ fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            ExitCode::from(if error.is::<cli::Usage>() { 2 } else { 1 })
+            ExitCode::from(if error.is::<cli::UsageError>() { 2 } else { 1 })
         }
     }
 }

@@ -1,20 +1,19 @@
-//! How much memory a pass takes and how much is there, asked before an image is denoised.
+//! Available memory, measured before an image is denoised.
 //!
-//! What a pass takes is known beforehand ([`demc_model::inference::peak_bytes`]); what is there, on Linux, is the least of
-//! what the machine has left and what the limits of this process's control groups leave (containers, batch systems).
-//! Memory that this process keeps for its next image counts as left. Elsewhere nothing is known and nothing refused.
+//! On Linux, it is the minimum of the machine's available memory and of what each control group of
+//! this process leaves (containers, batch systems). Memory that this process keeps for its next
+//! image counts as available. On other systems it is unknown, and no image is refused.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
-use demc_model::inference::{peak_bytes, reusable_bytes};
-use demc_model::{ModelConfig, Ops};
+use demc_model::inference::reusable_bytes;
 
-/// An image of which not even the smallest tile fits into memory.
+/// The smallest tile of an image does not fit into memory.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "{width}x{height} pixels do not fit into memory: a tile of at most {tile} x {tile} takes {needed} MiB beside the network, {available} MiB are available"
+    "{width}x{height} pixels do not fit into memory: the smallest tile, at most {tile} x {tile}, needs {needed} MiB in addition to the network; {available} MiB are available"
 )]
 pub struct TooLarge {
     /// The image's width in pixels, padded.
@@ -23,66 +22,50 @@ pub struct TooLarge {
     pub height: usize,
     /// Longest side of the smallest tile with its halo, pixels.
     pub tile: usize,
-    /// What it needs, MiB.
+    /// Its required memory, MiB.
     pub needed: u64,
-    /// What is there, MiB.
+    /// Available memory, MiB.
     pub available: u64,
 }
 
-/// Values that Burn's own operations hold at a time, for each value of the largest map; 7 to 8 were measured (`--ops burn` on `flex`, width 16, the paper's
-/// levels, 256x256 to 1280x720).
-const STOCK_VALUES: u64 = 10;
+/// Assumed bytes for a pass on a device that does not report its memory (ours: half of a small
+/// graphics card).
+const ASSUMED_BUDGET: u64 = 4 << 30;
 
-/// What a pass may take on a device that does not tell its memory, bytes (ours: half of a small graphics card).
-const UNTOLD: u64 = 4 << 30;
-
-/// Bytes that a pass over `height` x `width` pixels, multiples of 32, takes beside the network where `ops` compute.
-pub fn pass_bytes(ops: Ops, config: &ModelConfig, height: usize, width: usize) -> u64 {
-    match ops {
-        Ops::Kernels => peak_bytes(config, height, width),
-        Ops::Burn => {
-            // Of the fusion sub-network and of each level, a quarter of the pixels from one to the next.
-            let levels = config.level_channels().into_iter().enumerate();
-            let maps = levels.map(|(level, channels)| (channels * height * width) >> (2 * level));
-            let largest = maps.fold(config.width * height * width, usize::max);
-            STOCK_VALUES * largest as u64 * size_of::<f32>() as u64
-        }
-    }
-}
-
-/// What a pass on `device` may take, bytes; none where nothing is known.
+/// Bytes that a pass on `device` may use; `None` if unknown.
 pub fn budget(device: &Device) -> Option<u64> {
     match *device == Device::flex() {
         true => available(),
-        false => Some(UNTOLD),
+        false => Some(ASSUMED_BUDGET),
     }
 }
 
-/// Bytes that this process can still take without swapping; none where the system does not tell.
+/// Bytes that this process can still allocate without swapping; `None` if the system does not
+/// report it.
 pub fn available() -> Option<u64> {
     available_below(Path::new("/")).map(|bytes| bytes + reusable_bytes())
 }
 
-/// The same by the files below `root`.
+/// Available bytes according to the files below `root`.
 fn available_below(root: &Path) -> Option<u64> {
     let machine = value(&root.join("proc/meminfo"), "MemAvailable:")? << 10;
     let groups = control_groups(root).into_iter();
     groups
-        .filter_map(|group| group.left())
+        .filter_map(|group| group.available())
         .chain([machine])
         .min()
 }
 
-/// A control group that may limit memory, of either version.
-struct Group {
+/// A control group of version 1 or 2.
+struct ControlGroup {
     folder: PathBuf,
-    /// Names of the files with limit and usage, and of the entry of file caches that are given up on demand.
+    /// Names of the files with limit and usage, and of the entry with reclaimable file caches.
     names: [&'static str; 3],
 }
 
-impl Group {
-    /// Bytes below its limit; none where it has no limit.
-    fn left(&self) -> Option<u64> {
+impl ControlGroup {
+    /// Available bytes below its limit; `None` without a limit.
+    fn available(&self) -> Option<u64> {
         let [limit, usage, caches] = self.names;
         let number = |name| {
             fs::read_to_string(self.folder.join(name))
@@ -91,7 +74,7 @@ impl Group {
                 .parse()
                 .ok()
         };
-        // `max`, where there is no limit, is no number.
+        // Without a limit, the file holds `max`.
         let limit: u64 = number(limit)?;
         let used: u64 = number(usage)?;
         let caches = value(&self.folder.join("memory.stat"), caches).unwrap_or(0);
@@ -99,8 +82,8 @@ impl Group {
     }
 }
 
-/// The control groups that this process is in, and all above them: each may have a limit.
-fn control_groups(root: &Path) -> Vec<Group> {
+/// The control groups of this process and their ancestors; each may have a limit.
+fn control_groups(root: &Path) -> Vec<ControlGroup> {
     const VERSION_1: [&str; 3] = [
         "memory.limit_in_bytes",
         "memory.usage_in_bytes",
@@ -110,7 +93,7 @@ fn control_groups(root: &Path) -> Vec<Group> {
     let lines = fs::read_to_string(root.join("proc/self/cgroup")).unwrap_or_default();
     let mut groups = Vec::new();
     for line in lines.lines() {
-        // Hierarchy, controllers, path; version 2 names no controllers.
+        // Fields: hierarchy, controllers, path. Version 2 has no controllers.
         let mut fields = line.splitn(3, ':').skip(1);
         let (Some(controllers), Some(path)) = (fields.next(), fields.next()) else {
             continue;
@@ -123,7 +106,7 @@ fn control_groups(root: &Path) -> Vec<Group> {
             _ => continue,
         };
         let above = Path::new(path.trim_start_matches('/')).ancestors();
-        groups.extend(above.map(|path| Group {
+        groups.extend(above.map(|path| ControlGroup {
             folder: root.join(folder).join(path),
             names,
         }));
@@ -131,7 +114,7 @@ fn control_groups(root: &Path) -> Vec<Group> {
     groups
 }
 
-/// The number after `name` at the beginning of a line.
+/// The number in the line of `file` that starts with `name`.
 fn value(file: &Path, name: &str) -> Option<u64> {
     let text = fs::read_to_string(file).ok()?;
     let mut fields = text
@@ -145,7 +128,7 @@ fn value(file: &Path, name: &str) -> Option<u64> {
 mod tests {
     use super::*;
 
-    /// Files below a root of their own.
+    /// A root directory with these files.
     fn system(files: &[(&str, &str)]) -> tempfile::TempDir {
         let root = tempfile::tempdir().expect("a directory");
         for (path, text) in files {
@@ -162,11 +145,11 @@ mod tests {
     );
 
     #[test]
-    fn the_least_of_machine_and_groups_counts() {
+    fn available_memory_is_the_minimum_of_machine_and_groups() {
         let available = |files: &[(&str, &str)]| available_below(system(files).path());
         assert_eq!(available(&[]), None);
         assert_eq!(available(&[MACHINE]), Some(4000 << 10));
-        // Version 2: the group has no limit, the one above it has; caches are given up.
+        // Version 2: only the parent group has a limit; caches are reclaimable.
         let unlimited = ("sys/fs/cgroup/job/step/memory.max", "max\n");
         let files = [
             MACHINE,
@@ -181,7 +164,7 @@ mod tests {
         ];
         assert_eq!(available(&files), Some(500_000));
         assert_eq!(available(&files[..3]), Some(4000 << 10));
-        // Version 1, in a container whose own path is not mounted.
+        // Version 1 in a container whose path is not mounted.
         let files = [
             MACHINE,
             (
@@ -196,7 +179,7 @@ mod tests {
 
     #[test]
     #[cfg(target_os = "linux")]
-    fn this_machine_tells() {
+    fn this_machine_reports_its_memory() {
         assert!(available().is_some_and(|bytes| bytes > 1 << 20));
     }
 }

@@ -1,8 +1,8 @@
-//! Any size to a multiple of 32 and back: the network halves five times (Fig. 3), so its sides must divide by 2^5
-//! ([`DOWNSAMPLING`]).
+//! Pads images to multiples of 32 and crops them back. The network halves the resolution five times
+//! (Fig. 3), so both sides must be multiples of 2^5 ([`DOWNSAMPLING`]).
 //!
-//! The image grows to the right and downwards by repeating its last column and row, which leaves no edge that the
-//! network could take for one of the scene (ours: the paper trains and tests on sizes that divide).
+//! The last column and row are repeated to the right and downwards. This creates no edge that the
+//! network could mistake for one in the scene (ours: the paper's sizes are multiples).
 
 use std::ops::Range;
 
@@ -36,36 +36,36 @@ impl Padding {
     /// `[C, H, W]` -> `[C, padded H, padded W]`
     ///
     /// # Panics
-    /// When `planes` does not hold whole planes of at least one pixel.
+    /// If `planes` does not hold whole planes of at least one pixel.
     pub fn pad(&self, planes: &[f32]) -> Vec<f32> {
         self.cut(planes, 0..self.padded_height(), 0..self.padded_width())
     }
 
-    /// A part of the padded planes, without padding the rest.
+    /// Cuts a part out of the padded planes, without padding the rest.
     ///
     /// # Shapes
     /// `[C, H, W]` -> `[C, rows, columns]`
     ///
     /// # Panics
-    /// When `planes` does not hold whole planes of at least one pixel.
+    /// If `planes` does not hold whole planes of at least one pixel.
     pub fn cut(&self, planes: &[f32], rows: Range<usize>, columns: Range<usize>) -> Vec<f32> {
         let Self { height, width } = *self;
         assert!(height > 0 && width > 0 && planes.len().is_multiple_of(height * width));
         let channels = planes.len() / (height * width);
         let inside = columns.start.min(width)..columns.end.min(width);
-        let beyond = columns.len() - inside.len();
+        let padding = columns.len() - inside.len();
         let mut part = Vec::with_capacity(channels * rows.len() * columns.len());
         for plane in planes.chunks_exact(height * width) {
             for y in rows.clone() {
                 let row = &plane[y.min(height - 1) * width..][..width];
                 part.extend_from_slice(&row[inside.clone()]);
-                part.extend(std::iter::repeat_n(row[width - 1], beyond));
+                part.extend(std::iter::repeat_n(row[width - 1], padding));
             }
         }
         part
     }
 
-    /// Puts a tile's core in its place, as far as it lies on the image.
+    /// Copies the part of a tile's core that lies inside the image.
     ///
     /// # Shapes
     /// `tile` is `[C, rows.read, columns.read]`, `planes` `[C, H, W]`.
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_is_the_part_of_the_padded_image() {
+    fn a_cut_equals_that_part_of_the_padded_image() {
         let padding = Padding {
             height: 40,
             width: 50,
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn tiles_cut_and_pasted_are_the_image() {
+    fn tiles_cut_and_pasted_give_the_image() {
         let (height, width) = (70, 100);
         let padding = Padding { height, width };
         let planes = pattern(3, height, width);

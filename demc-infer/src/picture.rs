@@ -1,4 +1,5 @@
-//! 8-bit pictures to look at: HDR images tone mapped by `clip(x, 0, 1)^(1 / 2.2)`, side by side and stacked.
+//! 8-bit pictures for people: HDR images tone mapped by `clip(x, 0, 1)^(1 / 2.2)`, side by side and
+//! stacked.
 
 use std::io;
 use std::path::Path;
@@ -10,7 +11,8 @@ use demc_model::metrics::DISPLAY_GAMMA;
 const GAP: usize = 4;
 /// Colour of the gap.
 const GAP_RGB: [u8; 3] = [255; 3];
-/// Share of a detail map's values that are not clipped: a few bright pixels must not darken the rest.
+/// Share of a detail map's values that are not clipped, so that a few bright pixels do not darken
+/// the rest.
 const DETAIL_QUANTILE: f64 = 0.995;
 
 /// An 8-bit RGB picture.
@@ -29,20 +31,21 @@ impl Picture {
     /// Planar `[3, height, width]`.
     ///
     /// # Panics
-    /// When `planes` has another length.
+    /// If `planes` has another length.
     pub fn from_hdr(planes: &[f32], height: usize, width: usize) -> Self {
         Self::from_planes(planes, height, width, |x| {
             x.clamp(0.0, 1.0).powf(1.0 / DISPLAY_GAMMA)
         })
     }
 
-    /// A detail map (Fig. 2 e), which has no unit: linear from 0 to the 99.5th percentile of its values.
+    /// A detail map (Fig. 2 e), which has no unit: linear from 0 to the 99.5th percentile of its
+    /// values.
     ///
     /// # Shapes
     /// Planar `[3, height, width]`, not negative.
     ///
     /// # Panics
-    /// When `planes` has another length.
+    /// If `planes` has another length.
     pub fn from_detail_map(planes: &[f32], height: usize, width: usize) -> Self {
         let mut sorted = planes.to_vec();
         sorted.sort_by(f32::total_cmp);
@@ -75,13 +78,13 @@ impl Picture {
         (self.width, self.height)
     }
 
-    /// A strip `noisy | detail map | denoised | reference` of a frame, from what there is of them.
+    /// A strip `noisy | detail map | denoised | reference` of a frame; absent images are left out.
     ///
     /// # Shapes
     /// `detail_map` and `denoised` are planar `[3, H, W]` of the frame's size.
     ///
     /// # Panics
-    /// When a length differs.
+    /// If a length differs.
     pub fn strip(frame: &Frame, detail_map: Option<&[f32]>, denoised: &[f32]) -> Self {
         let Frame { width, height, .. } = *frame;
         let hdr = |planes: &[f32]| Self::from_hdr(planes, height, width);
@@ -96,13 +99,13 @@ impl Picture {
         Self::beside(&parts.into_iter().flatten().collect::<Vec<_>>())
     }
 
-    /// Pictures from left to right with a thin white gap between them; a lower one is filled up with white.
+    /// Pictures from left to right with a thin white gap; smaller ones are filled up with white.
     pub fn beside(pictures: &[Picture]) -> Self {
-        let turned: Vec<_> = pictures.iter().map(Self::transposed).collect();
-        Self::above(&turned).transposed()
+        let transposed: Vec<_> = pictures.iter().map(Self::transposed).collect();
+        Self::above(&transposed).transposed()
     }
 
-    /// Pictures from top to bottom with a thin white gap between them; a narrower one is filled up with white.
+    /// Pictures from top to bottom with a thin white gap; narrower ones are filled up with white.
     pub fn above(pictures: &[Picture]) -> Self {
         let width = pictures.iter().map(|p| p.width).max().unwrap_or(0);
         let mut rgb = Vec::new();
@@ -131,10 +134,10 @@ impl Picture {
         }
     }
 
-    /// The bytes of a PNG file. It states its gamma of 1/2.2, so that viewers show it as meant.
+    /// The bytes of a PNG file. The file states its gamma of 1/2.2 for correct display.
     ///
     /// # Errors
-    /// A picture without pixels, or one too large for PNG.
+    /// The picture has no pixels, or is too large for PNG.
     pub fn to_png(&self) -> Result<Vec<u8>, png::EncodingError> {
         let mut bytes = Vec::new();
         let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
@@ -148,10 +151,10 @@ impl Picture {
         Ok(bytes)
     }
 
-    /// Writes a PNG file, whole or not at all.
+    /// Writes a PNG file atomically.
     ///
     /// # Errors
-    /// As [`to_png`](Self::to_png), or a path that cannot be written.
+    /// As [`to_png`](Self::to_png), or the path cannot be written.
     pub fn write_png(&self, path: &Path) -> Result<(), demc_data::Error> {
         demc_data::file::write_whole(path, |file| {
             io::Write::write_all(file, &self.to_png().map_err(io::Error::other)?)
@@ -203,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn a_strip_shows_what_there_is() {
+    fn a_strip_leaves_out_absent_images() {
         let mut frame = crate::bundle::testing::frame(5, 3);
         let denoised = frame.color.clone();
         let width = |parts: usize| (5 * parts + GAP * (parts - 1), 3);
@@ -216,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn a_png_reads_back_as_it_was() {
+    fn a_png_survives_a_round_trip() {
         let picture = Picture::beside(&[grey(5, 7, 0.3), grey(5, 2, 0.9)]);
         let bytes = picture.to_png().expect("encoded");
         let mut reader = png::Decoder::new(io::Cursor::new(bytes))

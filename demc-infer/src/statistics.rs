@@ -1,26 +1,27 @@
 //! Means and paired differences with bootstrap intervals (Efron 1979) over images and seeds.
 //!
-//! A table of scores has a row a seed and a column an image. A resample draws seeds and images, each with replacement and
-//! independently, and takes the mean of the cells where they cross; the interval is that between the 2.5 % and 97.5 %
-//! quantiles of such means. Comparisons are paired: the cells are differences of two variants on the same image, trained
-//! from the same seed on the same batches.
+//! A table of scores has one row per seed and one column per image. A resample draws seeds and
+//! images independently and with replacement, and takes the mean over their cells. The interval
+//! lies between the 2.5 % and 97.5 % quantiles of these means. Comparisons are paired: a cell is
+//! the difference of two variants on the same image, trained from the same seed on the same
+//! batches.
 
 use demc_model::metrics::Better;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-/// Resamples of an interval; ours.
+/// Number of resamples per interval (ours).
 pub const RESAMPLES: usize = 10_000;
-/// Share of the resampled means outside of an interval.
+/// Share of the resampled means outside an interval.
 const OUTSIDE: f64 = 0.05;
-/// Seed of the resampling, so that a table is the same every time.
+/// Seed of the resampling, for reproducible tables.
 const SEED: u64 = 1;
 
 /// A mean and its 95 % interval.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Estimate {
-    /// Of all cells.
+    /// Mean of all cells.
     pub mean: f64,
     /// Lower and upper end of the interval.
     pub interval: [f64; 2],
@@ -30,7 +31,7 @@ impl Estimate {
     /// The mean of `scores[seed][image]` with its interval; `None` for an empty table.
     ///
     /// # Panics
-    /// Where the rows are not of one length.
+    /// If rows differ in length.
     pub fn of(scores: &[Vec<f64>]) -> Option<Self> {
         let (seeds, images) = (scores.len(), scores.first()?.len());
         if images == 0 {
@@ -61,7 +62,7 @@ impl Estimate {
     /// The paired difference `a - b`; `None` for empty tables.
     ///
     /// # Panics
-    /// Where the tables are not of one size.
+    /// If the tables differ in size.
     pub fn of_difference(a: &[Vec<f64>], b: &[Vec<f64>]) -> Option<Self> {
         assert_eq!(a.len(), b.len(), "tables of the same seeds");
         let rows = a.iter().zip(b).map(|(a, b)| {
@@ -71,7 +72,7 @@ impl Estimate {
         Self::of(&rows.collect::<Vec<_>>())
     }
 
-    /// What a difference in `metric` says, in words.
+    /// A difference in `metric` as text, with its significance.
     pub fn verdict(&self, metric: &str, better: Better) -> String {
         let word = match (self.is_significant(), better.prefers(self.mean)) {
             (false, _) => "no significant difference",
@@ -83,16 +84,16 @@ impl Estimate {
         format!("{word} in {metric} ({mean:+.4}, 95 % {low:+.4} to {high:+.4})")
     }
 
-    /// Whether zero lies outside of the interval.
+    /// Whether the interval excludes zero.
     pub fn is_significant(&self) -> bool {
         self.interval[0] > 0.0 || self.interval[1] < 0.0
     }
 }
 
-/// A quantile of sorted values, between two of them where it falls there.
+/// A quantile of sorted values, with linear interpolation.
 fn quantile(sorted: &[f64], share: f64) -> f64 {
-    let place = share * (sorted.len() - 1) as f64;
-    let (below, rest) = (place.floor() as usize, place.fract());
+    let position = share * (sorted.len() - 1) as f64;
+    let (below, rest) = (position.floor() as usize, position.fract());
     let above = (below + 1).min(sorted.len() - 1);
     sorted[below] + rest * (sorted[above] - sorted[below])
 }
@@ -107,14 +108,14 @@ mod tests {
     }
 
     #[test]
-    fn quantiles_of_a_ramp_are_its_places() {
+    fn quantiles_of_a_ramp_are_its_positions() {
         let ramp: Vec<f64> = (0..=100).map(f64::from).collect();
         assert_eq!(quantile(&ramp, 0.025), 2.5);
         assert_eq!(quantile(&ramp, 1.0), 100.0);
     }
 
     #[test]
-    fn equal_scores_have_no_width_and_no_table_no_mean() {
+    fn equal_scores_have_an_empty_interval_and_an_empty_table_no_mean() {
         let equal = vec![vec![0.25; 3]; 2];
         let found = Estimate::of(&equal).unwrap();
         assert_eq!((found.mean, found.interval), (0.25, [0.25; 2]));
@@ -125,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn a_verdict_knows_which_way_is_better() {
+    fn a_verdict_respects_the_direction_of_the_metric() {
         let found = |mean, interval| Estimate { mean, interval };
         assert_eq!(
             found(-0.5, [-0.75, -0.25]).verdict("relmse", Better::Lower),
@@ -140,7 +141,8 @@ mod tests {
         );
     }
 
-    /// Of one seed, the interval is that of the mean of n values: 1.96 deviations by sqrt(n) on both sides.
+    /// For one seed, the interval is that of the mean of n values: 1.96 deviations / sqrt(n) to
+    /// both sides.
     #[test]
     fn interval_of_one_seed_is_that_of_the_central_limit() {
         let mut rng = ChaCha8Rng::seed_from_u64(5);
@@ -161,7 +163,7 @@ mod tests {
         );
     }
 
-    /// Two variants that differ from image to image far more than from each other: only pairing sees the difference.
+    /// Images differ far more than the two variants: only pairing detects the difference.
     #[test]
     fn pairing_finds_a_small_difference_between_widely_different_images() {
         let mut rng = ChaCha8Rng::seed_from_u64(6);
@@ -180,7 +182,7 @@ mod tests {
         assert!(a.interval[1] > b.interval[0], "unpaired they overlap");
     }
 
-    /// What seeds do to all images at once widens the interval, however many images there are.
+    /// An effect of the seed on all images widens the interval for any number of images.
     #[test]
     fn seeds_that_disagree_widen_the_interval() {
         let mut rng = ChaCha8Rng::seed_from_u64(7);

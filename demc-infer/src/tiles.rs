@@ -1,11 +1,13 @@
-//! How an image is cut into tiles that a device has the memory for, so that the tiles together are the whole image.
+//! Cuts an image into tiles that fit into memory and together give the result of the whole image.
 //!
-//! An output pixel depends on inputs at most 188 px away in the encoders and the decoder, and 4 px more in the fusion
-//! sub-network: with a halo of 192 px ([`EXACT_HALO`]) around each tile, cut off again from its output, and with origins on
-//! multiples of 32, where the network's own grid is, nothing changes but the order of some sums. At an image's edge the halo ends,
-//! as the image does. A smaller halo is faster and only nearly the same.
+//! In the encoders and the decoder, an output pixel depends on inputs at most 188 px away; the
+//! fusion sub-network adds 4 px. Each tile therefore has a halo of 192 px ([`EXACT_HALO`]), which
+//! is cut off its output. Tiles start at multiples of 32, the network's grid. Then only the order
+//! of some sums changes. The halo ends at the image's edge. A smaller halo is faster and
+//! approximate.
 //!
-//! Tiles form a grid. Of all grids whose largest tile fits, the plan is the one that computes the fewest pixels.
+//! Tiles form a grid. Of all grids whose largest tile fits, [`Tiles::plan`] takes the one that
+//! computes the fewest pixels.
 
 use std::ops::Range;
 
@@ -13,17 +15,20 @@ use demc_model::DOWNSAMPLING;
 
 use crate::memory::TooLarge;
 
-/// Width of the halo in pixels with which tiles equal the whole image: the receptive field's reach (`188 + 4`).
+/// Width of the halo in pixels at which tiles equal the whole image: the reach of the receptive
+/// field (`188 + 4`).
 pub const EXACT_HALO: usize = 192;
 
-/// How an image may be cut; the default is exact, in as few and as large tiles as memory allows.
+/// Options for tiles. The default is exact, with as few tiles as memory allows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Tiling {
-    /// Width of the halo in pixels, taken up to a multiple of 32; below [`EXACT_HALO`] the result is approximate.
+    /// Width of the halo in pixels, rounded up to a multiple of 32. Below [`EXACT_HALO`] the result
+    /// is approximate.
     pub halo: usize,
-    /// Longest side of a tile in pixels without its halo, at least 32, taken down to a multiple of 32; none: as memory allows.
+    /// Longest side of a tile in pixels without its halo, at least 32, rounded down to a multiple
+    /// of 32; `None`: as memory allows.
     pub side: Option<usize>,
-    /// Bytes that a pass may take; none: what is there.
+    /// Bytes that a pass may use; `None`: the available memory.
     pub memory: Option<u64>,
 }
 
@@ -38,12 +43,12 @@ impl Default for Tiling {
 }
 
 impl Tiling {
-    /// Whether the tiles together equal the whole image.
+    /// Whether the tiles give the result of the whole image.
     pub fn is_exact(&self) -> bool {
         self.halo >= EXACT_HALO
     }
 
-    /// The halo on the network's grid.
+    /// The halo, rounded up to the network's grid.
     fn grid_halo(&self) -> usize {
         self.halo.next_multiple_of(DOWNSAMPLING)
     }
@@ -52,27 +57,30 @@ impl Tiling {
 /// The tiles of a padded image: every combination of a row and a column.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Tiles {
-    /// From the top down.
+    /// Rows from top to bottom.
     pub rows: Vec<Span>,
-    /// From left to right.
+    /// Columns from left to right.
     pub columns: Vec<Span>,
 }
 
-/// One tile's share of an axis, in pixels; both ranges start and end on multiples of 32.
+/// One tile's range on an axis, in pixels. Both ranges start and end on multiples of 32.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Span {
-    /// What it makes. The spans of an axis lie side by side.
+    /// The pixels that the tile outputs. The cores of an axis are adjacent.
     pub core: Range<usize>,
-    /// What it reads: the core with its halo, as far as the image goes.
+    /// The pixels that the tile takes as input: the core with its halo, inside the image.
     pub read: Range<usize>,
 }
 
 impl Tiles {
-    /// The best grid for a padded image of `height` x `width` pixels, multiples of 32, in which no tile takes more than `available`
-    /// bytes (none: no limit); `need` tells how many one of a height and a width takes.
+    /// The grid with the fewest computed pixels for a padded image of `height` x `width` pixels
+    /// (multiples of 32).
+    ///
+    /// `need` returns the bytes of a tile of a height and a width. No tile needs more than
+    /// `available` bytes; `None` is no limit.
     ///
     /// # Errors
-    /// If not even the smallest tile fits.
+    /// The smallest tile does not fit.
     pub fn plan(
         (height, width): (usize, usize),
         tiling: &Tiling,
@@ -94,7 +102,7 @@ impl Tiles {
         let (rows, columns) = (axis(height), axis(width));
         let mut best: Option<(u64, Self)> = None;
         for rows in &rows {
-            // Finer columns than the first that fit compute more.
+            // Columns finer than the first fit compute more.
             let Some(columns) = columns.iter().find(|columns| fits(rows, columns)) else {
                 continue;
             };
@@ -124,7 +132,7 @@ impl Tiles {
         self.rows.len() * self.columns.len()
     }
 
-    /// All tiles: rows, columns.
+    /// All tiles as pairs of a row and a column.
     pub fn iter(&self) -> impl Iterator<Item = (&Span, &Span)> {
         self.rows
             .iter()
@@ -149,7 +157,7 @@ impl Tiles {
     }
 }
 
-/// An axis of `blocks` times 32 pixels in `count` spans, as equal as they get.
+/// Cuts an axis of `blocks` times 32 pixels into `count` spans of nearly equal length.
 fn spans(blocks: usize, count: usize, halo: usize) -> Vec<Span> {
     let edge = |i: usize| i * blocks / count * DOWNSAMPLING;
     (0..count)
@@ -169,7 +177,7 @@ fn longest(spans: &[Span]) -> usize {
 mod tests {
     use super::*;
 
-    /// A byte a pixel.
+    /// A memory need of one byte per pixel.
     fn pixels(height: usize, width: usize) -> u64 {
         (height * width) as u64
     }
@@ -179,16 +187,16 @@ mod tests {
     }
 
     #[test]
-    fn what_fits_stays_whole() {
+    fn an_image_that_fits_is_one_tile() {
         let tiles = plan((736, 1280), Tiling::default(), 736 * 1280).expect("it fits");
         assert_eq!((tiles.count(), tiles.largest()), (1, (736, 1280)));
         assert_eq!(tiles.computed_pixels(), 736 * 1280);
     }
 
-    /// Cores cover every pixel once; a halo is whole but at the image's edge; every number is on the grid of 32; nothing is above
-    /// the limit.
+    /// Cores cover every pixel once. Halos are complete except at the image's edge. Every number is
+    /// a multiple of 32. No tile exceeds the limit.
     #[test]
-    fn tiles_cover_the_image_once_whatever_the_limit() {
+    fn tiles_cover_the_image_once_for_every_limit() {
         for (height, width) in [(32, 32), (736, 1280), (2176, 3840), (96, 8192)] {
             for available in [420 * 420, 700 * 700, 1500 * 900] {
                 for halo in [0, 64, EXACT_HALO] {
@@ -215,7 +223,7 @@ mod tests {
         }
     }
 
-    /// The least of all grids, found by trying every one.
+    /// Compares with every possible grid.
     #[test]
     fn no_grid_that_fits_computes_less() {
         let (height, width, available) = (736, 1280, 900 * 700);
@@ -234,19 +242,19 @@ mod tests {
     }
 
     #[test]
-    fn a_side_that_is_asked_for_is_kept() {
+    fn the_longest_side_is_respected() {
         let tiling = Tiling {
             side: Some(300),
             ..Tiling::default()
         };
         let tiles = plan((736, 1280), tiling, u64::MAX).expect("no limit");
         let cores = tiles.rows.iter().chain(&tiles.columns);
-        // 40 and 23 blocks of 32, 9 of them at most in one: 5 tiles of 8, and 3 of 7 or 8.
+        // 40 and 23 blocks of 32, at most 9 per tile: 5 tiles of 8, and 3 of 7 or 8.
         assert_eq!(cores.map(|span| span.core.len()).max(), Some(256));
     }
 
     #[test]
-    fn where_nothing_fits_the_smallest_tile_is_named() {
+    fn an_image_too_large_names_the_smallest_tile() {
         let error = plan((4320, 7680), Tiling::default(), 1 << 10).expect_err("1 KiB");
         assert_eq!(error.tile, 416);
     }

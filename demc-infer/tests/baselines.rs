@@ -1,4 +1,4 @@
-//! `demc-infer evaluate` and `report` with other programs' images.
+//! Tests of `demc-infer evaluate` and `report` with baselines.
 
 mod common;
 
@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use common::{demc_infer, run_directory, sample};
-use demc_data::{ChannelLayout, Precision, read_frame, write_rgb};
+use demc_data::{ChannelLayout, SamplePrecision, read_frame, write_rgb};
 use demc_model::metrics::METRICS;
 use serde_json::Value;
 
@@ -17,17 +17,29 @@ const SCENES: [&str; 4] = [
     "gen-table-test-1",
 ];
 
-/// A directory with an image a scene: what `of` makes of the reference.
-fn images(dir: &Path, name: &str, of: impl Fn(f32) -> f32) -> PathBuf {
+/// A directory with one image per scene: the reference with `change` applied to each value.
+fn images(dir: &Path, name: &str, change: impl Fn(f32) -> f32) -> PathBuf {
     let out = dir.join(name);
     fs::create_dir(&out).expect("directory");
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
     for scene in SCENES {
         let frame = read_frame(&sample().join(format!("test/{scene}.exr")), &layout);
         let frame = frame.expect("a scene");
-        let planes: Vec<f32> = frame.reference.iter().flatten().map(|x| of(*x)).collect();
+        let planes: Vec<f32> = frame
+            .reference
+            .iter()
+            .flatten()
+            .map(|x| change(*x))
+            .collect();
         let path = out.join(format!("{scene}.exr"));
-        write_rgb(&path, frame.width, frame.height, &planes, Precision::Float).expect("written");
+        write_rgb(
+            &path,
+            frame.width,
+            frame.height,
+            &planes,
+            SamplePrecision::Float,
+        )
+        .expect("written");
     }
     out
 }
@@ -117,7 +129,7 @@ fn missing_images_and_other_sizes_are_named_before_anything_is_computed() {
         list
     };
     for verb in ["evaluate", "report"] {
-        let outcome = demc_infer(list(verb)).failure(1, "baseline other: no ");
+        let outcome = demc_infer(list(verb)).failure(1, "baseline other: missing ");
         for scene in &SCENES[1..3] {
             assert!(
                 outcome.stderr.contains(&format!("{scene}.exr")),
@@ -130,7 +142,7 @@ fn missing_images_and_other_sizes_are_named_before_anything_is_computed() {
     assert!(!run.path().join("page.html").exists());
     for scene in &SCENES[1..3] {
         let path = dir.join(format!("{scene}.exr"));
-        write_rgb(&path, 2, 3, &[1.0; 18], Precision::Half).expect("written");
+        write_rgb(&path, 2, 3, &[1.0; 18], SamplePrecision::Half).expect("written");
     }
     let outcome = demc_infer(list("evaluate")).failure(1, "");
     assert!(
@@ -143,17 +155,17 @@ fn missing_images_and_other_sizes_are_named_before_anything_is_computed() {
 }
 
 #[test]
-fn what_cannot_be_asked_for_is_exit_code_2() {
+fn invalid_flags_are_exit_code_2() {
     let ask = |flag: &str, value: &str| {
         demc_infer(arguments!["evaluate", "--data", sample(), flag, value])
     };
-    ask("--metrics", "smape,mse").failure(2, "--metrics: no metric \"mse\"; there are relmse, ");
+    ask("--metrics", "smape,mse").failure(2, "--metrics: unknown metric \"mse\"; known: relmse, ");
     ask("--baseline", "noisy=x").failure(2, "--baseline noisy: ");
     let outcome = ask("--baseline", "x");
     assert_eq!(outcome.code, 2, "{}", outcome.stderr);
 }
 
-/// What the page says is what `evaluate` says; what it does is for `report_browser.rs`.
+/// The page has the numbers of `evaluate`. `report_browser.rs` tests its behaviour.
 #[test]
 fn a_report_is_one_file_with_the_numbers_of_evaluate() {
     let run = run_directory();

@@ -1,4 +1,4 @@
-//! `demc-infer evaluate`, `export` and `inspect` as a user runs them.
+//! Tests of `demc-infer evaluate`, `export` and `inspect` through the binary.
 
 mod common;
 
@@ -20,7 +20,7 @@ fn evaluate(model: &Path, flags: &[&str]) -> Outcome {
     demc_infer(list.into_iter().chain(flags.iter().map(OsString::from)))
 }
 
-/// The scores that it gives.
+/// The scores from `demc-infer evaluate`.
 fn scores(model: &Path, flags: &[&str]) -> Value {
     let outcome = evaluate(model, &[&["--json", "-"], flags].concat()).success();
     serde_json::from_str(&outcome.stdout).expect("only JSON")
@@ -58,7 +58,7 @@ fn evaluate_prints_a_table_and_writes_the_same_numbers_as_json() {
         let mut found: Vec<_> = metrics.iter().map(String::as_str).collect();
         found.sort_unstable();
         assert_eq!(found, sorted, "all metrics, always");
-        // Black against any reference: at most 3, and near it for one well above sqrt(epsilon).
+        // A black image scores at most 3, and nearly 3 for a reference well above sqrt(epsilon).
         let black = image["black"]["relmse"].as_f64().expect("number");
         assert!((1.0..3.0).contains(&black), "{black}");
         assert!(
@@ -95,15 +95,15 @@ fn the_noisy_scores_are_those_of_the_manifest() {
             scene["noisy_relmse"].as_f64(),
         );
         let (ours, theirs) = (ours.expect("number"), theirs.expect("number"));
-        // The manifest's number is from before the images were rounded to half and negative radiance was clamped:
-        // 1.5 % on gen-table-test-1, which has some, and 1e-4 on the others.
+        // The manifest's number dates from before rounding to half and clamping of negative
+        // radiance: 1.5 % on gen-table-test-1, which has negative radiance, and 1e-4 on the others.
         assert!((ours - theirs).abs() < 0.02 * theirs, "{ours} {theirs}");
         assert_eq!(image["reference_residual"], scene["ref_residual_relmse"]);
     }
 }
 
 #[test]
-fn evaluate_without_a_data_set_is_one_line() {
+fn evaluate_without_a_data_set_is_a_one_line_error() {
     let run = run_directory();
     let outcome = demc_infer(arguments![
         "evaluate",
@@ -116,7 +116,7 @@ fn evaluate_without_a_data_set_is_one_line() {
 }
 
 #[test]
-fn an_export_gives_the_same_scores_in_either_style_of_names() {
+fn an_export_gives_the_same_scores_with_both_naming_schemes() {
     let run = run_directory();
     let file = run.path().join("torch.safetensors");
     let format = ["--format", "safetensors"];
@@ -176,7 +176,7 @@ fn inspect_shows_the_model_as_text_and_as_json() {
 }
 
 #[test]
-fn a_model_that_is_none_is_one_line() {
+fn an_invalid_model_is_a_one_line_error() {
     let run = run_directory();
     let empty = run.path().join("empty");
     fs::create_dir(&empty).expect("made");
@@ -236,9 +236,9 @@ fn no_arguments_show_the_commands() {
     }
 }
 
-/// Kernels and Burn's operations, and every instruction path of this machine, score the same.
+/// Kernels, Burn's operations, and every instruction set of this machine give the same score.
 #[test]
-fn every_way_to_compute_scores_the_same() {
+fn operations_and_instruction_sets_give_the_same_score() {
     use demc_model::ops::Isa;
     let run = run_directory();
     let score = |flag: &str, value: &str| -> f64 {
@@ -249,7 +249,7 @@ fn every_way_to_compute_scores_the_same() {
     let burn = score("--ops", "burn");
     for isa in Isa::available() {
         let kernels = score("--isa", isa.name());
-        // Outputs agree to 1e-5 of the largest; the score squares them.
+        // Outputs agree to 1e-5 of the largest value; the score squares them.
         assert!(
             (kernels / burn - 1.0).abs() < 1e-4,
             "{isa}: {kernels} {burn}"
@@ -258,21 +258,21 @@ fn every_way_to_compute_scores_the_same() {
 }
 
 #[test]
-fn operations_and_instructions_that_do_not_exist_are_usage_errors() {
+fn unknown_operations_and_instruction_sets_are_usage_errors() {
     let run = run_directory();
-    for (flag, listed) in [("--ops", "kernels, burn"), ("--isa", "portable")] {
+    for (flag, listed) in [("--ops", "kernels or burn"), ("--isa", "portable")] {
         let outcome = evaluate(run.path(), &[flag, "none"]);
         assert_eq!(outcome.code, 2, "{}", outcome.stderr);
         assert!(outcome.stderr.contains(listed), "{}", outcome.stderr);
     }
 }
 
-/// A mean over several looks is another image, of the same frames; how many there are is not free.
+/// Every number of passes gives another image; only 1, 4 and 8 are accepted.
 #[test]
-fn an_ensemble_is_asked_for_by_its_number_of_looks() {
+fn ensemble_takes_1_4_or_8_passes() {
     let run = run_directory();
-    let score = |looks: &str| -> f64 {
-        let report = scores(run.path(), &["--ensemble", looks]);
+    let score = |passes: &str| -> f64 {
+        let report = scores(run.path(), &["--ensemble", passes]);
         let relmse = &report["mean"]["denoised"]["relmse"];
         relmse.as_f64().expect("number")
     };
@@ -280,6 +280,6 @@ fn an_ensemble_is_asked_for_by_its_number_of_looks() {
     assert!(one != four && four != eight, "{one} {four} {eight}");
     let outcome = evaluate(run.path(), &["--ensemble", "3"]);
     assert_eq!(outcome.code, 2, "{}", outcome.stderr);
-    let listed = "there are ensembles of 1, 4 and 8 looks";
+    let listed = "the number of passes must be 1, 4 or 8";
     assert!(outcome.stderr.contains(listed), "{}", outcome.stderr);
 }

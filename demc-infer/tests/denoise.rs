@@ -1,4 +1,4 @@
-//! `demc-infer denoise` as a user runs it.
+//! Tests of `demc-infer denoise` through the binary.
 
 mod common;
 
@@ -72,7 +72,7 @@ fn float_output_repeats_byte_for_byte() {
 }
 
 #[test]
-fn several_images_fill_a_directory_and_a_bad_one_stops_nothing() {
+fn several_images_fill_a_directory_and_a_bad_one_is_skipped() {
     let (run, dir) = (run_directory(), tempfile::tempdir().expect("directory"));
     let bad = dir.path().join("bad.exr");
     fs::write(&bad, "no image").expect("written");
@@ -91,7 +91,7 @@ fn several_images_fill_a_directory_and_a_bad_one_stops_nothing() {
         .collect();
     assert_eq!(lines.len(), 2, "{}", outcome.stderr);
     assert!(lines[0].contains("bad.exr"), "{}", outcome.stderr);
-    assert_eq!(lines[1], "error: 1 of 3 images not denoised");
+    assert_eq!(lines[1], "error: 1 of 3 images were not denoised");
     let mut names: Vec<_> = fs::read_dir(&out)
         .expect("made")
         .map(|e| e.expect("entry").file_name())
@@ -164,7 +164,8 @@ fn a_device_that_is_unknown_or_not_built_is_exit_code_2() {
 fn channels_that_do_not_fit_the_layout_are_listed() {
     let (run, dir) = (run_directory(), tempfile::tempdir().expect("directory"));
     let input = dir.path().join("rgb-only.exr");
-    demc_data::write_rgb(&input, 2, 1, &[0.5; 6], demc_data::Precision::Half).expect("written");
+    demc_data::write_rgb(&input, 2, 1, &[0.5; 6], demc_data::SamplePrecision::Half)
+        .expect("written");
     let outcome = denoise(run.path(), &[&input], &dir.path().join("out.exr"));
     assert_eq!(outcome.code, 1);
     assert!(
@@ -179,9 +180,9 @@ fn channels_that_do_not_fit_the_layout_are_listed() {
     );
 }
 
-/// Without `--model` the program uses the one that it comes with, which never saw the sample's test scenes.
+/// The default is the bundled model, which was not trained on the sample's test scenes.
 #[test]
-fn the_programs_own_model_denoises() {
+fn the_bundled_model_denoises() {
     let out = tempfile::tempdir().expect("directory");
     let layout = random_bundle().meta.layout;
     for name in ["col-classroom-1.exr", "gen-room-test-1.exr"] {
@@ -197,18 +198,22 @@ fn the_programs_own_model_denoises() {
         assert!(found < 0.15 * noisy.min(black), "{name}: {found}");
     }
     let shown = demc_infer(arguments!["inspect"]).success();
-    assert!(shown.stdout.contains("demc-infer"), "{}", shown.stdout);
+    assert!(
+        shown.stdout.contains("the bundled model"),
+        "{}",
+        shown.stdout
+    );
 }
 
-/// It is part of the program and of the repository.
+/// The bundled model is part of the program and of the repository.
 #[test]
-fn the_programs_own_model_is_small() {
+fn the_bundled_model_is_small() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/demc.safetensors");
     assert!(fs::metadata(path).expect("a model").len() <= 30_000_000);
 }
 
 #[test]
-fn a_directory_is_gone_on_with_where_it_stopped() {
+fn a_partly_finished_directory_is_resumed() {
     let (run, dir) = (run_directory(), tempfile::tempdir().expect("directory"));
     let out = dir.path().join("out");
     let whole = |extra: &[&str]| {
@@ -216,8 +221,8 @@ fn a_directory_is_gone_on_with_where_it_stopped() {
         list.push(sample().join("test").into());
         list.extend(extra.iter().map(Into::into));
         let stderr = demc_infer(list).success().stderr;
-        // A random network has warnings of its own.
-        let done = stderr.lines().find(|line| line.contains("there already"));
+        // A random network also causes warnings.
+        let done = stderr.lines().find(|line| line.contains("already exist"));
         done.map(str::to_owned)
     };
     assert_eq!(whole(&[]), None);
@@ -226,7 +231,7 @@ fn a_directory_is_gone_on_with_where_it_stopped() {
     fs::remove_file(&path).expect("removed");
     let kept = out.join("gen-table-test-1.exr");
     fs::write(&kept, "not touched").expect("written");
-    let note = "note: 3 of 4 images are there already; --overwrite replaces them";
+    let note = "note: 3 of 4 images already exist; --overwrite replaces them";
     assert_eq!(whole(&[]).as_deref(), Some(note));
     assert_eq!(fs::read(&path).expect("made again"), first);
     assert_eq!(fs::read(&kept).expect("kept"), b"not touched");
@@ -237,7 +242,7 @@ fn a_directory_is_gone_on_with_where_it_stopped() {
 }
 
 #[test]
-fn a_file_that_exists_needs_overwrite() {
+fn an_existing_output_needs_overwrite() {
     let (run, dir) = (run_directory(), tempfile::tempdir().expect("directory"));
     let (input, output) = (
         sample_image("gen-table-test-1.exr"),
@@ -286,9 +291,9 @@ fn a_sequence_is_denoised_frame_by_frame() {
     );
 }
 
-/// The whole image and its tiles, through files in float.
+/// Compares the whole image with tiles in float files.
 #[test]
-fn tiles_are_announced_and_equal_the_whole_image() {
+fn tiles_are_reported_and_equal_the_whole_image() {
     let (run, dir) = (run_directory(), tempfile::tempdir().expect("directory"));
     let input = sample_image("col-classroom-1.exr");
     let with = |name: &str, flags: &[&str]| {
@@ -303,7 +308,7 @@ fn tiles_are_announced_and_equal_the_whole_image() {
     let (_, whole) = with("whole.exr", &[]);
     let (note, tiled) = with("tiled.exr", &["--tile", "64"]);
     assert!(
-        note.contains("4 x 4 tiles of at most 256x256 pixels, halo 192: 16.00"),
+        note.contains("4 x 4 tiles of at most 256x256 pixels with halo 192, 16.00 times"),
         "{note}"
     );
     let largest = whole.iter().fold(0.0f32, |most, x| most.max(*x));
@@ -314,7 +319,7 @@ fn tiles_are_announced_and_equal_the_whole_image() {
     assert!(same);
     let (note, _) = with("near.exr", &["--tile", "64", "--halo", "32"]);
     assert!(
-        note.contains("against exact tiles, at 3 places on seams: RelMSE"),
+        note.contains("error at seams, from 3 windows denoised exactly: RelMSE"),
         "{note}"
     );
     let list = arguments![

@@ -1,4 +1,5 @@
-//! The inputs of `fuzz/` for bundles: its seeds are sound, its findings once did harm.
+//! Tests with the inputs of `fuzz/` for bundles: valid seeds, and findings that once caused a
+//! failure.
 
 use std::collections::HashMap;
 use std::fs;
@@ -8,21 +9,21 @@ use demc_infer::BundleFile;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 
-fn folder(of: &str) -> PathBuf {
+fn folder(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../fuzz")
-        .join(of)
+        .join(name)
 }
 
-fn inputs(of: &str) -> Vec<(PathBuf, Vec<u8>)> {
-    let files = fs::read_dir(folder(of)).expect("it is in the repository");
+fn inputs(name: &str) -> Vec<(PathBuf, Vec<u8>)> {
+    let files = fs::read_dir(folder(name)).expect("it is in the repository");
     let paths = files.map(|file| file.expect("readable").path());
     paths
         .map(|path| (path.clone(), fs::read(path).expect("readable")))
         .collect()
 }
 
-/// The header of the model that ships and its smallest tensors. To write them again:
+/// Writes the header and the smallest tensors of the bundled model:
 /// `cargo test --release -p demc-infer --test fuzz_inputs -- --ignored`.
 #[test]
 #[ignore = "writes into fuzz/seeds"]
@@ -35,7 +36,7 @@ fn write_seeds() {
     for (name, dtype, names) in [("f32", Dtype::F32, "burn"), ("f16", Dtype::F16, "torch")] {
         let mut chosen = Vec::new();
         for (tensor, view) in tensors.iter() {
-            // Of a tensor of four bytes a sample, the first half are samples of two.
+            // The first half of the bytes of an f32 tensor serve as f16 values.
             let length = view.data().len() / if dtype == Dtype::F16 { 2 } else { 1 };
             if length <= 128 && view.dtype() == Dtype::F32 {
                 let data = if dtype == Dtype::F16 {
@@ -74,7 +75,7 @@ fn every_seed_of_a_bundle_parses() {
 }
 
 #[test]
-fn every_finding_in_a_bundle_is_one_line_now() {
+fn every_finding_in_a_bundle_is_a_one_line_error() {
     for (path, bytes) in inputs("findings/bundle") {
         if let Err(error) = BundleFile::parse(path.clone(), &bytes) {
             let message = error.to_string();
@@ -86,7 +87,7 @@ fn every_finding_in_a_bundle_is_one_line_now() {
 
 #[cfg(unix)]
 #[test]
-fn a_path_that_is_no_file_is_refused_at_once() {
+fn a_path_to_no_regular_file_is_refused_at_once() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let fifo = dir.path().join("fifo");
     let made = std::process::Command::new("mkfifo").arg(&fifo).status();

@@ -1,4 +1,4 @@
-//! Warnings on the sample's scenes: none as they are, one for each mistake that people make with their renderer.
+//! Warnings on the sample's scenes: none for the originals, one for each common mistake.
 
 mod common;
 
@@ -6,13 +6,13 @@ use common::{demc_infer, random_bundle, sample};
 use demc_data::{Dataset, Frame, Split, Statistics, read_frame};
 use demc_infer::{Bundle, Names, Precision};
 
-/// A network that knows what the sample's training scenes are like, and all of the sample's frames.
+/// A network with the statistics of the sample's training scenes, and all of the sample's frames.
 fn trained() -> (Bundle, Vec<(Split, Frame)>) {
     let mut bundle = random_bundle();
     let layout = bundle.meta.layout.clone();
     let dataset = Dataset::open(&sample(), &layout).expect("the sample");
     let training = dataset.split(Split::Train).expect("training scenes");
-    let statistics = Statistics::measure(&training, &layout, 2.2, 0.0).expect("sound");
+    let statistics = Statistics::measure(&training, &layout, 2.2, None, 1e-3).expect("sound");
     bundle.meta.normalizer = statistics.normalizer;
     bundle.meta.ranges = Some(statistics.ranges);
     let frames = dataset.scenes.iter().map(|scene| {
@@ -63,7 +63,7 @@ fn test_scenes_pass_and_mistakes_are_named() {
             frame.name
         );
         assert!(
-            swapped.contains("texture1: it goes down"),
+            swapped.contains("texture1: its minimum is"),
             "{}: {swapped}",
             frame.name
         );
@@ -102,7 +102,7 @@ fn check_prints_the_table_and_fails_on_a_warning() {
         outcome.stdout
     );
 
-    // Ranges that nothing is in.
+    // A range that no image is in.
     let mut strict = bundle;
     let ranges = strict.meta.ranges.as_mut().expect("they were set");
     ranges.exposure = demc_data::ranges::Range {
@@ -123,7 +123,7 @@ fn check_prints_the_table_and_fails_on_a_warning() {
     assert!(
         outcome
             .stderr
-            .ends_with("error: 4 of 4 images with warnings\n"),
+            .ends_with("error: 4 of 4 images have warnings\n"),
         "{}",
         outcome.stderr
     );

@@ -1,5 +1,5 @@
-//! `demc-infer export --format onnx`, `export --verify` and `import` as a user runs them; the interpreters are programs that
-//! only pretend. The real ones run in `tests/tests/python_live.rs`.
+//! Tests of `demc-infer export --format onnx`, `export --verify` and `import` through the binary.
+//! Shell scripts stand in for Python, which `tests/tests/python_live.rs` uses.
 
 mod common;
 
@@ -9,7 +9,8 @@ use std::path::{Path, PathBuf};
 use common::{Outcome, demc_infer, export, random_bundle, run_directory};
 use demc_infer::{Names, Precision};
 
-/// A shell script that stands in for Python. Its arguments are those of `verify`: `-c SCRIPT KIND FILE FOLDER`.
+/// A shell script that stands in for Python. Its arguments are those of `verify`: `-c SCRIPT KIND
+/// FILE FOLDER`.
 #[cfg(unix)]
 fn interpreter(folder: &Path, script: &str) -> PathBuf {
     use std::os::unix::fs::PermissionsExt;
@@ -32,7 +33,7 @@ fn verified(script: &str) -> (Outcome, bool) {
 
 #[cfg(unix)]
 #[test]
-fn what_deviates_fails_after_its_numbers_were_printed() {
+fn a_deviation_fails_after_its_numbers_were_printed() {
     // The noisy colour instead of the denoised one.
     let copy = r#"for i in 0 1 2 3; do cp "$5/$i.color" "$5/$i.output"; done; echo Copy 1.0"#;
     let (outcome, exists) = verified(copy);
@@ -52,7 +53,7 @@ fn what_deviates_fails_after_its_numbers_were_printed() {
 
 #[cfg(unix)]
 #[test]
-fn an_interpreter_that_is_no_help_is_one_line_that_says_what_to_do() {
+fn an_unusable_interpreter_is_a_one_line_error_with_advice() {
     for (script, expected) in [
         (
             "echo \"No module named 'onnxruntime'\" >&2; exit 3",
@@ -90,13 +91,13 @@ fn an_onnx_export_is_half_as_large_in_f16() {
         export(run.path(), &file, &flags).success();
         fs::metadata(file).expect("file").len()
     };
-    // The graph itself is 15 kB in either.
+    // The graph itself has 15 kB in both files.
     let (full, half) = (size("f32"), size("f16"));
     assert!(half < full * 6 / 10 + 20_000, "{half} of {full}");
 }
 
 #[test]
-fn an_import_is_what_was_exported_byte_for_byte() {
+fn an_import_equals_the_export_byte_for_byte() {
     let run = run_directory();
     let file = |name: &str| run.path().join(name);
     let (torch, back, again) = (file("torch"), file("back"), file("again"));
@@ -140,9 +141,10 @@ fn an_import_is_what_was_exported_byte_for_byte() {
 fn weights_without_a_header_need_a_model() {
     let run = run_directory();
     let bare = run.path().join("bare.safetensors");
-    let mut weights = random_bundle().model.weights();
-    for weight in &mut weights {
-        weight.name = Names::Torch.from_burn(&weight.name);
+    let bundle = random_bundle();
+    let mut weights = bundle.model.weights();
+    for (weight, spec) in weights.iter_mut().zip(bundle.meta.model.weight_specs()) {
+        weight.name = Names::Torch.in_file(&spec);
     }
     let bytes = demc_infer::bundle::tensors::to_bytes(&weights).expect("bytes");
     fs::write(&bare, bytes).expect("written");

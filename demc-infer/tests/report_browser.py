@@ -1,6 +1,6 @@
-"""What a report does in a browser: `python report_browser.py REPORT.html [SCREENSHOTS]`, from `report_browser.rs`.
+"""Tests a report in a browser: `python report_browser.py REPORT.html [SCREENSHOTS]`, run by `report_browser.rs`.
 
-Needs playwright of PyPI and Chromium (`DEMC_CHROMIUM`, else `chromium` on the path). Fails with an assertion.
+Needs playwright from PyPI and Chromium (`DEMC_CHROMIUM`, or `chromium` on the path). Fails with an assertion.
 """
 
 import os
@@ -15,7 +15,7 @@ PIXELS = """(id) => { const c = document.getElementById(id); const d = c.getCont
 
 
 def settle(page: Page, change) -> None:
-    """Runs `change` and waits until the viewer has drawn what it asks for."""
+    """Runs `change` and waits until the viewer has drawn the new state."""
     change()
     page.wait_for_function(
         """() => { const s = document.getElementById('stage'), v = (id) => document.getElementById(id).value;

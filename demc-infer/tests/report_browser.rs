@@ -1,7 +1,8 @@
-//! A report in a real Chromium: what `report_browser.py` tries.
+//! Tests a report in Chromium with `report_browser.py`.
 //!
-//! Needs a Python with playwright and a Chromium: `DEMC_PYTHON` names the one, `DEMC_CHROMIUM` (or the path) has the other.
-//! Without `DEMC_PYTHON` the test says that it was skipped; with `DEMC_REQUIRE_CHROMIUM=1` it fails.
+//! `DEMC_PYTHON` names a Python with playwright, `DEMC_CHROMIUM` a Chromium (default: `chromium` on
+//! the path). Without `DEMC_PYTHON` the test prints that it is skipped; with
+//! `DEMC_REQUIRE_CHROMIUM=1` it fails.
 
 mod common;
 
@@ -18,7 +19,7 @@ fn a_report_works_in_a_browser() {
             std::env::var("DEMC_REQUIRE_CHROMIUM").as_deref() != Ok("1"),
             "DEMC_REQUIRE_CHROMIUM=1, but DEMC_PYTHON is not set"
         );
-        // Not `println!`, which the test harness swallows.
+        // The test harness would hide the output of `println!`.
         writeln!(std::io::stderr(), "skipped: DEMC_PYTHON is not set").expect("stderr");
         return;
     };

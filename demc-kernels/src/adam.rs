@@ -1,33 +1,34 @@
 //! Adam (Kingma and Ba 2014) in one pass over weight, gradient and moments.
 //!
-//! The operations and their order are Burn's (burn-optim 0.22), each rounded once: the same bits as its Adam, on every
-//! path. The bias corrections are moved from the moments to the step size and epsilon (end of their Sec. 2).
+//! The operations and their order are Burn's (burn-optim 0.22), each rounded once: the same bits as
+//! its Adam, on every path. The bias corrections are moved from the moments to the step size and
+//! epsilon (end of their Sec. 2).
 
 use crate::Isa;
 use crate::simd::{self, Leaf, Simd};
 use crate::tasks::{self, TASK};
 
-/// The rule.
+/// Hyperparameters of Adam.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Adam {
     /// Learning rate.
     pub lr: f32,
-    /// Decay of the first moment, a step.
+    /// Decay of the first moment per step.
     pub beta_1: f32,
-    /// Decay of the second moment, a step.
+    /// Decay of the second moment per step.
     pub beta_2: f32,
-    /// Added to the root of the second moment, in units of the gradient.
+    /// Added to the square root of the second moment, in units of the gradient.
     pub epsilon: f32,
 }
 
-/// Step number `step`, counted from 1, of one weight tensor: moves `weight` against `grad` and updates its moments
-/// `first` and `second`, which are 0 before step 1.
+/// Updates one weight tensor and its moments by one step. `step` counts from 1; the moments `first`
+/// and `second` are 0 before step 1.
 ///
 /// # Shapes
-/// All four slices have the weight's length.
+/// All four slices have the length of the weight.
 ///
 /// # Panics
-/// Where the lengths differ, or at step 0.
+/// If the lengths differ, or at step 0.
 pub fn step(
     isa: Isa,
     rule: &Adam,
@@ -44,25 +45,25 @@ pub fn step(
         "grad, first and second moment of a weight of {} values",
         weight.len()
     );
-    let factors = Factors::new(rule, step);
+    let factors = StepFactors::new(rule, step);
     let moments = first.chunks_mut(TASK).zip(second.chunks_mut(TASK));
     let pieces = weight.chunks_mut(TASK).zip(grad.chunks(TASK)).zip(moments);
     tasks::each(pieces, |((weight, grad), (first, second))| {
-        let leaf = Step {
+        let leaf = AdamStep {
             factors,
             weight,
             grad,
             first,
             second,
         };
-        // SAFETY: the leaf has slices only.
+        // SAFETY: the leaf accesses memory through slices only.
         unsafe { simd::run(tasks::streaming(isa), leaf) }
     });
 }
 
 /// The scalars of a step.
 #[derive(Clone, Copy)]
-struct Factors {
+struct StepFactors {
     beta_1: f32,
     rest_1: f32,
     beta_2: f32,
@@ -72,13 +73,13 @@ struct Factors {
     lr: f32,
 }
 
-impl Factors {
+impl StepFactors {
     fn new(rule: &Adam, step: u64) -> Self {
         assert!(step > 0, "steps count from 1");
         // Beyond 2^31 steps both powers are 0.
         let time = i32::try_from(step).unwrap_or(i32::MAX);
         let root = (1.0 - rule.beta_2.powi(time)).sqrt();
-        Factors {
+        StepFactors {
             beta_1: rule.beta_1,
             rest_1: 1.0 - rule.beta_1,
             beta_2: rule.beta_2,
@@ -90,18 +91,18 @@ impl Factors {
     }
 }
 
-struct Step<'a> {
-    factors: Factors,
+struct AdamStep<'a> {
+    factors: StepFactors,
     weight: &'a mut [f32],
     grad: &'a [f32],
     first: &'a mut [f32],
     second: &'a mut [f32],
 }
 
-impl Leaf for Step<'_> {
+impl Leaf for AdamStep<'_> {
     type Out = ();
 
-    /// A plain loop, which the compiler vectorises for the path: products and sums are not to be fused.
+    /// A plain loop that the compiler vectorises for the path. Products and sums must not be fused.
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
         let f = self.factors;
@@ -147,12 +148,13 @@ mod tests {
 
     /// Algorithm 1 of the paper, in float64.
     fn paper(size: usize, steps: u64) -> [Vec<f64>; 3] {
-        let of = |values: Vec<f32>| -> Vec<f64> { values.into_iter().map(f64::from).collect() };
+        let float64 =
+            |values: Vec<f32>| -> Vec<f64> { values.into_iter().map(f64::from).collect() };
         let [lr, b1, b2, epsilon] = [1e-2, 0.9, 0.999, 1e-8];
         let (mut weight, mut first, mut second) =
-            (of(pattern(size, 1)), vec![0.0; size], vec![0.0; size]);
+            (float64(pattern(size, 1)), vec![0.0; size], vec![0.0; size]);
         for t in 1..=steps {
-            for (i, g) in of(pattern(size, 1 + t as u32)).into_iter().enumerate() {
+            for (i, g) in float64(pattern(size, 1 + t as u32)).into_iter().enumerate() {
                 first[i] = b1 * first[i] + (1.0 - b1) * g;
                 second[i] = b2 * second[i] + (1.0 - b2) * g * g;
                 let hat = (
@@ -165,9 +167,10 @@ mod tests {
         [weight, first, second]
     }
 
-    /// Three roundings a step of values of order 1, and decays that float32 holds to 1e-8 of 1 - 0.999.
+    /// Each step has three roundings of values of order 1. float32 holds the decays to 1e-8 of 1 -
+    /// 0.999.
     #[test]
-    #[cfg_attr(miri, ignore = "its powi is off at random")]
+    #[cfg_attr(miri, ignore = "Miri rounds powi at random")]
     fn steps_are_those_of_the_paper() {
         for size in [1, 5, 16, 129, TASK + 3] {
             let expected = paper(size, 4);
@@ -181,7 +184,7 @@ mod tests {
 
     /// The tensor operations of burn-optim 0.22.1's `AdaptiveMomentum::transform`, one by one.
     #[test]
-    #[cfg_attr(miri, ignore = "its powi is off at random")]
+    #[cfg_attr(miri, ignore = "Miri rounds powi at random")]
     fn bits_are_those_of_burns_operations() {
         let size = 133;
         let (mut weight, mut first, mut second) =
@@ -208,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    #[cfg_attr(miri, ignore = "its powi is off at random")]
+    #[cfg_attr(miri, ignore = "Miri rounds powi at random")]
     fn bits_do_not_depend_on_the_threads() {
         let size = 3 * TASK + 5;
         for isa in Isa::available() {
@@ -217,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gradient_that_is_no_number_reaches_the_weight() {
+    fn a_nan_gradient_reaches_the_weight() {
         for isa in Isa::available() {
             let mut weight = [1.0; 3];
             step(

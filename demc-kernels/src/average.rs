@@ -6,37 +6,37 @@ use crate::tasks::{self, TASK};
 
 /// Moves `average` towards `live` by `share` of the way: `average += share * (live - average)`.
 ///
-/// Each operation is rounded once: the same bits on every path.
+/// Each operation is rounded once, so all paths give the same bits.
 ///
 /// # Shapes
-/// Both slices have one length.
+/// Both slices have the same length.
 ///
 /// # Panics
-/// Where the lengths differ.
-pub fn towards(isa: Isa, average: &mut [f32], live: &[f32], share: f32) {
+/// If the lengths differ.
+pub fn update(isa: Isa, average: &mut [f32], live: &[f32], share: f32) {
     assert_eq!(average.len(), live.len(), "average and values of one size");
     let pieces = average.chunks_mut(TASK).zip(live.chunks(TASK));
     tasks::each(pieces, |(average, live)| {
-        let leaf = Towards {
+        let leaf = UpdateAverage {
             average,
             live,
             share,
         };
-        // SAFETY: the leaf has slices only.
+        // SAFETY: the leaf accesses memory through slices only.
         unsafe { simd::run(tasks::streaming(isa), leaf) }
     });
 }
 
-struct Towards<'a> {
+struct UpdateAverage<'a> {
     average: &'a mut [f32],
     live: &'a [f32],
     share: f32,
 }
 
-impl Leaf for Towards<'_> {
+impl Leaf for UpdateAverage<'_> {
     type Out = ();
 
-    /// A plain loop, which the compiler vectorises for the path.
+    /// A plain loop that the compiler vectorises for the path.
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
         for (average, live) in self.average.iter_mut().zip(self.live) {
@@ -51,7 +51,7 @@ mod tests {
     use crate::testing::{assert_within, bits, pattern, same_on_any_number_of_threads};
 
     #[test]
-    fn average_goes_its_share_of_the_way() {
+    fn average_moves_by_its_share() {
         for isa in Isa::available() {
             for size in [0, 1, 7, 33, TASK + 5] {
                 let size = if cfg!(miri) { size.min(33) } else { size };
@@ -61,29 +61,29 @@ mod tests {
                     .zip(&live)
                     .map(|(a, l)| f64::from(*a) + 0.25 * (f64::from(*l) - f64::from(*a)))
                     .collect();
-                towards(isa, &mut average, &live, 0.25);
+                update(isa, &mut average, &live, 0.25);
                 assert_within(&format!("{isa}, {size} values"), &average, &expected, 1e-6);
             }
         }
     }
 
     #[test]
-    fn all_of_the_way_is_the_value_and_none_changes_nothing() {
+    fn a_share_of_one_gives_the_value_and_zero_changes_nothing() {
         let (before, live) = (pattern(40, 1), vec![2.0; 40]);
         let mut average = vec![1.0; 40];
-        towards(Isa::current(), &mut average, &live, 1.0);
+        update(Isa::current(), &mut average, &live, 1.0);
         assert_eq!(average, live);
         let mut average = before.clone();
-        towards(Isa::current(), &mut average, &live, 0.0);
+        update(Isa::current(), &mut average, &live, 0.0);
         assert_eq!(average, before);
     }
 
     #[test]
-    #[cfg_attr(miri, ignore = "minutes long")]
+    #[cfg_attr(miri, ignore = "takes minutes")]
     fn bits_depend_neither_on_the_path_nor_on_the_threads() {
         let work = |isa| {
             let mut average = pattern(3 * TASK + 5, 1);
-            towards(isa, &mut average, &pattern(3 * TASK + 5, 2), 0.001);
+            update(isa, &mut average, &pattern(3 * TASK + 5, 2), 0.001);
             bits(&average)
         };
         for isa in Isa::available() {

@@ -1,11 +1,12 @@
-//! The pixels of a batch of maps, and the way between channels first and channels last.
+//! The size of a batch of maps, and the conversion between channels first and channels last.
 
 use crate::Isa;
 use crate::scratch::Shared;
 use crate::simd::{self, Leaf, Simd};
 use crate::tasks;
 
-/// How many images of which size. A map on it has `pixels() * channels` values, channels last.
+/// Number of images and their size. A map on a grid has `pixels() * channels` values, channels
+/// last.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Grid {
     /// Images.
@@ -22,7 +23,7 @@ impl Grid {
         self.batch * self.height * self.width
     }
 
-    /// The grid after a 2x2 pooling (odd rows and columns at the end are dropped).
+    /// The grid after a 2x2 pooling. An odd last row or column is dropped.
     pub fn halved(self) -> Self {
         Grid {
             height: self.height / 2,
@@ -43,7 +44,7 @@ impl Grid {
     /// Channels of a map of `len` values.
     ///
     /// # Panics
-    /// Where `len` is no multiple of the pixels.
+    /// If `len` is not a multiple of the pixels.
     pub fn channels(self, len: usize) -> usize {
         let pixels = self.pixels();
         assert!(
@@ -54,10 +55,10 @@ impl Grid {
     }
 }
 
-/// Channels last from channels first.
+/// Converts channels first to channels last.
 ///
 /// # Panics
-/// Where the lengths do not fit.
+/// If a length does not match the others.
 pub fn nhwc_from_nchw(grid: Grid, x: &[f32], y: &mut [f32]) {
     assert_eq!(x.len(), y.len(), "maps of one size");
     let (channels, plane) = (grid.channels(x.len()), grid.height * grid.width);
@@ -74,10 +75,10 @@ pub fn nhwc_from_nchw(grid: Grid, x: &[f32], y: &mut [f32]) {
     });
 }
 
-/// Channels first from channels last.
+/// Converts channels last to channels first.
 ///
 /// # Panics
-/// Where the lengths do not fit.
+/// If a length does not match the others.
 pub fn nchw_from_nhwc(grid: Grid, x: &[f32], y: &mut [f32]) {
     assert_eq!(x.len(), y.len(), "maps of one size");
     let (channels, plane) = (grid.channels(x.len()), grid.height * grid.width);
@@ -94,8 +95,8 @@ pub fn nchw_from_nhwc(grid: Grid, x: &[f32], y: &mut [f32]) {
     });
 }
 
-/// Transposes the pieces of each image; `piece` tells how, from pointers to the image in `x` and `y`, a first pixel and a
-/// number of pixels.
+/// Transposes the pieces of each image. `piece` builds the transposition from pointers to the image
+/// in `x` and `y`, the first pixel and the number of pixels.
 fn each_pixels(
     grid: Grid,
     channels: usize,
@@ -107,12 +108,13 @@ fn each_pixels(
     let step = tasks::rows_per_task(channels).next_multiple_of(64);
     let starts = (0..plane).step_by(step);
     let pieces = (0..grid.batch).flat_map(|image| starts.clone().map(move |first| (image, first)));
-    let to = Shared::new(y);
+    let target = Shared::new(y);
     tasks::each(pieces, |(image, first)| {
-        let at = image * plane * channels;
-        let (x, y) = (x[at..].as_ptr(), to.offset(at).pointer());
+        let offset = image * plane * channels;
+        let (x, y) = (x[offset..].as_ptr(), target.offset(offset).pointer());
         let leaf = piece(x, y, first, step.min(plane - first));
-        // SAFETY: the piece's pixels of all channels lie inside `x` and `y`, and no other piece has them.
+        // SAFETY: the piece's pixels of all channels lie inside `x` and `y`, and no other piece has
+        // them.
         unsafe { simd::run(tasks::streaming(Isa::current()), leaf) }
     });
 }
@@ -127,7 +129,7 @@ struct Transpose {
     columns: usize,
 }
 
-/// Fewest rows and columns of a tile that is not moved value by value.
+/// Minimum number of rows and columns of a tile that is moved by vectors.
 const NARROW: usize = 4;
 
 impl Leaf for Transpose {
@@ -135,7 +137,8 @@ impl Leaf for Transpose {
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        // Tiles of a vector's length both ways. The rows of the smaller side change fastest: whole lines are written.
+        // Tiles have the length of a vector in both directions. The shorter side varies fastest, so
+        // that whole cache lines are written.
         let (high, wide) = (
             self.rows.div_ceil(S::LANES),
             self.columns.div_ceil(S::LANES),
@@ -171,10 +174,10 @@ impl Leaf for Transpose {
 
 impl Transpose {
     /// # Safety
-    /// LANES rows and columns from `x` and to `y`.
+    /// `x` is readable and `y` writable for LANES rows and columns.
     #[inline(always)]
     unsafe fn whole_tile<S: Simd>(&self, x: *const f32, y: *mut f32) {
-        // SAFETY: the caller's.
+        // SAFETY: guaranteed by the caller.
         unsafe {
             let mut tile = [S::zero(); MOST_LANES];
             for (i, v) in tile[..S::LANES].iter_mut().enumerate() {
@@ -188,7 +191,7 @@ impl Transpose {
     }
 
     /// # Safety
-    /// As many rows and columns, at most LANES.
+    /// `x` is readable and `y` writable for these rows and columns, at most LANES.
     #[inline(always)]
     unsafe fn part_of_tile<S: Simd>(
         &self,
@@ -197,7 +200,7 @@ impl Transpose {
         rows: usize,
         columns: usize,
     ) {
-        // SAFETY: the caller's.
+        // SAFETY: guaranteed by the caller.
         unsafe {
             let mut tile = [S::zero(); MOST_LANES];
             for (i, v) in tile[..rows].iter_mut().enumerate() {
@@ -211,19 +214,20 @@ impl Transpose {
     }
 }
 
-/// Lanes of the longest vectors.
+/// Lanes of the widest vectors.
 const MOST_LANES: usize = 16;
 
-/// The first LANES vectors, transposed: each round interleaves the first half of the rows with the second.
+/// Transposes the first LANES vectors: each round interleaves the first half of the rows with the
+/// second.
 ///
 /// # Safety
-/// The path's instructions.
+/// The machine has the path of `S`.
 #[inline(always)]
 unsafe fn transposed<S: Simd>(mut tile: [S::V; MOST_LANES]) -> [S::V; MOST_LANES] {
     for _ in 0..S::LANES.ilog2() {
         let from = tile;
         for i in 0..S::LANES / 2 {
-            // SAFETY: the caller's.
+            // SAFETY: guaranteed by the caller.
             [tile[2 * i], tile[2 * i + 1]] =
                 unsafe { S::interleave(from[i], from[i + S::LANES / 2]) };
         }
@@ -236,7 +240,7 @@ mod tests {
     use super::*;
     use crate::testing::{grids, pattern};
 
-    /// On every path: the leaf that both directions share.
+    /// Tests, on every path, the leaf that both directions share.
     #[test]
     fn a_transposed_matrix_has_its_rows_for_columns() {
         for (rows, columns) in [
@@ -263,10 +267,10 @@ mod tests {
                 };
                 // SAFETY: both have rows * columns values.
                 unsafe { simd::run(isa, leaf) }
-                for (at, y) in found.iter().enumerate() {
+                for (offset, y) in found.iter().enumerate() {
                     // SAFETY: as above.
-                    let expected = unsafe { *x.add(at % rows * columns + at / rows) };
-                    assert!(*y == expected, "{isa}: {rows} x {columns} at {at}");
+                    let expected = unsafe { *x.add(offset % rows * columns + offset / rows) };
+                    assert!(*y == expected, "{isa}: {rows} x {columns} at {offset}");
                 }
             }
         }
@@ -288,8 +292,8 @@ mod tests {
                 let plane = grid.height * grid.width;
                 for (i, value) in last.iter().enumerate() {
                     let (pixel, c) = (i / channels, i % channels);
-                    let at = (pixel / plane * channels + c) * plane + pixel % plane;
-                    assert!(*value == x[at], "{grid:?} of {channels}");
+                    let offset = (pixel / plane * channels + c) * plane + pixel % plane;
+                    assert!(*value == x[offset], "{grid:?} of {channels}");
                 }
                 nchw_from_nhwc(grid, &last, &mut first);
                 assert!(first == x, "{grid:?} of {channels}");

@@ -1,11 +1,12 @@
-//! Which vector instructions to run on: found at run time, forced by a switch.
+//! The vector instructions to use: detected at run time, or forced.
 
 use std::fmt;
 use std::str::FromStr;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU8, Ordering};
 
-/// Environment variable that forces a path where [`Isa::force`] was not called; see [`Isa::current`].
+/// Environment variable that forces a path where [`Isa::force`] was not called; see
+/// [`Isa::current`].
 pub const VARIABLE: &str = "DEMC_ISA";
 
 /// An instruction path.
@@ -17,15 +18,18 @@ pub enum Isa {
     Avx2,
     /// NEON of AArch64, 4 lanes, 32 registers.
     Neon,
-    /// Plain Rust, which the compiler vectorises with what every machine of the architecture has.
+    /// Plain Rust, vectorised with the instructions that every machine of the architecture has.
     Portable,
 }
 
 /// A path that this machine does not have.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("instruction path `{name}` is unknown or not on this machine, which has: {}", list(&Isa::available()))]
+#[error(
+    "instruction path `{name}` is unknown or not on this machine, which has: {}",
+    list(&Isa::available())
+)]
 pub struct UnknownIsa {
-    /// What was asked for.
+    /// The requested name.
     pub name: String,
 }
 
@@ -35,7 +39,7 @@ fn list(paths: &[Isa]) -> String {
 }
 
 impl Isa {
-    /// All paths, best first.
+    /// All paths, the best first.
     const ALL: [Isa; 4] = [Isa::Avx512, Isa::Avx2, Isa::Neon, Isa::Portable];
 
     /// Name in switches and reports.
@@ -48,7 +52,7 @@ impl Isa {
         }
     }
 
-    /// Whether this machine has it.
+    /// Whether this machine has the path.
     pub(crate) fn is_available(self) -> bool {
         // Miri runs no vendor instructions.
         if cfg!(miri) {
@@ -72,7 +76,7 @@ impl Isa {
         }
     }
 
-    /// The paths of this machine, best first.
+    /// The paths of this machine, the best first.
     pub fn available() -> Vec<Isa> {
         Isa::ALL
             .into_iter()
@@ -80,9 +84,10 @@ impl Isa {
             .collect()
     }
 
-    /// The path to use: the one forced, else the one that the variable [`VARIABLE`] names, else the best.
+    /// The path to use: the forced one, else the one named by [`VARIABLE`], else the best.
     ///
-    /// A variable that names no path of this machine is ignored here; binaries check it with [`Isa::from_environment`].
+    /// Ignores a variable that names no path of this machine; binaries check it with
+    /// [`Isa::from_environment`].
     pub fn current() -> Isa {
         static DEFAULT: OnceLock<Isa> = OnceLock::new();
         match FORCED.load(Ordering::Relaxed) {
@@ -94,10 +99,10 @@ impl Isa {
         }
     }
 
-    /// The path that the variable [`VARIABLE`] names, if it is set.
+    /// The path named by the variable [`VARIABLE`], if it is set.
     ///
     /// # Errors
-    /// Where it names none of this machine.
+    /// If this machine does not have the named path.
     pub fn from_environment() -> Result<Option<Isa>, UnknownIsa> {
         match std::env::var(VARIABLE) {
             Ok(name) => name.parse().map(Some),
@@ -108,7 +113,7 @@ impl Isa {
     /// Makes [`Isa::current`] return `isa` in this process.
     ///
     /// # Panics
-    /// Where the machine does not have it.
+    /// If the machine does not have `isa`.
     pub fn force(isa: Isa) {
         assert!(isa.is_available(), "{isa} is not on this machine");
         FORCED.store(isa as u8, Ordering::Relaxed);

@@ -1,13 +1,14 @@
-//! The CPU operations of the DEMC networks, forward and backward: slices in, slices out.
+//! The CPU operations of the DEMC networks and their gradients, on slices.
 //!
-//! Every operation works on *maps*: a batch of images with their channels last, `[batch, height, width, channels]`,
-//! described by a [`Grid`] (batch, height, width) and a slice whose length tells the channels. Channels last makes every
-//! product of the network the same one, `pixels x channels` times `channels x channels`, with rows that vectors load as
-//! they lie. Weights come and go in the layouts of weight files: convolutions `[out, in, h, w]`, deconvolutions
-//! `[in, out, h, w]`.
+//! Every operation works on *maps*: a batch of images with their channels last, `[batch, height,
+//! width, channels]`. A [`Grid`] states batch, height and width; the length of the slice gives the
+//! channels. With channels last, every product of the network is `pixels x channels` times
+//! `channels x channels`, with rows that load as vectors. Weights have the layouts of weight files:
+//! convolutions `[out, in, h, w]`, deconvolutions `[in, out, h, w]`.
 //!
-//! The first argument of every operation is the instruction set ([`Isa`]) to run on; results are the same bits
-//! whatever the number of threads. Lengths that do not fit are a bug of the caller and panic with the shapes.
+//! The first argument of every operation is the instruction set ([`Isa`]). Results have the same
+//! bits for any number of threads. A wrong length is a bug of the caller; the operation panics and
+//! names the shapes.
 
 pub mod adam;
 pub mod average;

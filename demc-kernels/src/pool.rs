@@ -1,18 +1,19 @@
 //! Max-pooling over 2x2 windows with stride 2.
 //!
-//! NaN anywhere in a window is its maximum. The gradient goes to one value of each window, NaN or not.
+//! NaN anywhere in a window is its maximum. The gradient of a window goes to exactly one value, NaN
+//! or not.
 
 use crate::simd::{self, Leaf, Simd};
 use crate::tasks;
 use crate::{Grid, Isa};
 
-/// The maximum of each 2x2 window. An odd last row or column belongs to none.
+/// The maximum of each 2x2 window. An odd last row or column is ignored.
 ///
 /// # Shapes
-/// `x` on `grid` to `y` on `grid.halved()`, of as many channels.
+/// `x` on `grid`, `y` on `grid.halved()`, with the same number of channels.
 ///
 /// # Panics
-/// Where the lengths do not fit.
+/// If a length does not match the others.
 pub fn forward(isa: Isa, grid: Grid, x: &[f32], y: &mut [f32]) {
     let channels = check(grid, x.len(), y.len());
     let half = grid.halved();
@@ -27,11 +28,11 @@ pub fn forward(isa: Isa, grid: Grid, x: &[f32], y: &mut [f32]) {
     let pieces =
         images.flat_map(|(x, y)| x.chunks(rows * 2 * row).zip(y.chunks_mut(rows * half_row)));
     tasks::each(pieces, |(x, y)| {
-        // SAFETY: the leaf has slices and checks what it reads of them.
+        // SAFETY: the leaf has slices and checks its reads.
         unsafe {
             simd::run(
                 isa,
-                Forward {
+                PoolForward {
                     channels,
                     row,
                     half_row,
@@ -43,13 +44,14 @@ pub fn forward(isa: Isa, grid: Grid, x: &[f32], y: &mut [f32]) {
     });
 }
 
-/// The gradient by `x`, overwritten: `dy` at the first maximum of each window in row-major order, 0 elsewhere.
+/// Overwrites `dx`, the gradient with respect to `x`: `dy` at the first maximum of each window in
+/// row-major order, 0 elsewhere.
 ///
 /// # Shapes
-/// `x` and `dx` on `grid`, `dy` on `grid.halved()`, of as many channels.
+/// `x` and `dx` on `grid`, `dy` on `grid.halved()`, with the same number of channels.
 ///
 /// # Panics
-/// Where the lengths do not fit.
+/// If a length does not match the others.
 pub fn backward(isa: Isa, grid: Grid, x: &[f32], dy: &[f32], dx: &mut [f32]) {
     let channels = check(grid, x.len(), dy.len());
     assert_eq!(x.len(), dx.len(), "input and its gradient on {grid:?}");
@@ -66,18 +68,18 @@ pub fn backward(isa: Isa, grid: Grid, x: &[f32], dy: &[f32], dx: &mut [f32]) {
         .zip(dx.chunks_mut(image));
     let rows = tasks::rows_per_task(2 * row);
     let pieces = images.flat_map(|((x, dy), dx)| {
-        // An odd last row may be a piece of its own, without windows.
+        // An odd last row may form a piece without windows.
         let dy = dy.chunks(rows * half_row).chain(std::iter::repeat(&[][..]));
         x.chunks(rows * 2 * row)
             .zip(dy)
             .zip(dx.chunks_mut(rows * 2 * row))
     });
     tasks::each(pieces, |((x, dy), dx)| {
-        // SAFETY: the leaf has slices and checks what it reads of them.
+        // SAFETY: the leaf has slices and checks its reads.
         unsafe {
             simd::run(
                 isa,
-                Backward {
+                PoolBackward {
                     channels,
                     row,
                     half_row,
@@ -90,7 +92,7 @@ pub fn backward(isa: Isa, grid: Grid, x: &[f32], dy: &[f32], dx: &mut [f32]) {
     });
 }
 
-/// The channels.
+/// Checks all lengths and returns the number of channels.
 #[track_caller]
 fn check(grid: Grid, len: usize, half_len: usize) -> usize {
     let channels = grid.channels(len);
@@ -102,8 +104,8 @@ fn check(grid: Grid, len: usize, half_len: usize) -> usize {
     channels
 }
 
-/// Some pairs of rows of an image, each `row` values long, to rows of `half_row` values.
-struct Forward<'a> {
+/// Pairs of rows of an image, `row` values each, to rows of `half_row` values.
+struct PoolForward<'a> {
     channels: usize,
     row: usize,
     half_row: usize,
@@ -111,7 +113,7 @@ struct Forward<'a> {
     y: &'a mut [f32],
 }
 
-impl Leaf for Forward<'_> {
+impl Leaf for PoolForward<'_> {
     type Out = ();
 
     #[inline(always)]
@@ -130,18 +132,19 @@ impl Leaf for Forward<'_> {
                     (top.split_at(self.channels), bottom.split_at(self.channels));
                 let [a, b, c, d] = [a, b, c, d].map(<[f32]>::as_ptr);
                 let y = y.as_mut_ptr();
-                // SAFETY: a, b, c, d and y have `channels` values each, and `at + n` is at most that.
+                // SAFETY: a, b, c, d and y have `channels` values each, and `at + n` is at most
+                // that.
                 unsafe {
-                    let mut at = 0;
-                    while at + S::LANES <= self.channels {
-                        let [a, b, c, d] = [a, b, c, d].map(|p| S::load(p.add(at)));
-                        S::store(y.add(at), greatest::<S>(a, b, c, d));
-                        at += S::LANES;
+                    let mut offset = 0;
+                    while offset + S::LANES <= self.channels {
+                        let [a, b, c, d] = [a, b, c, d].map(|p| S::load(p.add(offset)));
+                        S::store(y.add(offset), greatest::<S>(a, b, c, d));
+                        offset += S::LANES;
                     }
-                    let n = self.channels - at;
+                    let n = self.channels - offset;
                     if n > 0 {
-                        let [a, b, c, d] = [a, b, c, d].map(|p| S::load_part(p.add(at), n));
-                        S::store_part(y.add(at), n, greatest::<S>(a, b, c, d));
+                        let [a, b, c, d] = [a, b, c, d].map(|p| S::load_part(p.add(offset), n));
+                        S::store_part(y.add(offset), n, greatest::<S>(a, b, c, d));
                     }
                 }
             }
@@ -150,18 +153,18 @@ impl Leaf for Forward<'_> {
 }
 
 /// # Safety
-/// The path's instructions.
+/// The machine has the path of `S`.
 #[inline(always)]
 unsafe fn greatest<S: Simd>(a: S::V, b: S::V, c: S::V, d: S::V) -> S::V {
-    // SAFETY: the caller's.
+    // SAFETY: guaranteed by the caller.
     unsafe {
         let pick = |first, second| S::nan_or(second, S::greater(second, first, second, first));
         pick(pick(a, b), pick(c, d))
     }
 }
 
-/// Some pairs of rows of an image and their gradient; an odd row may follow.
-struct Backward<'a> {
+/// Pairs of rows of an image and their gradient; an odd row may follow.
+struct PoolBackward<'a> {
     channels: usize,
     row: usize,
     half_row: usize,
@@ -170,7 +173,7 @@ struct Backward<'a> {
     dx: &'a mut [f32],
 }
 
-impl Leaf for Backward<'_> {
+impl Leaf for PoolBackward<'_> {
     type Out = ();
 
     #[inline(always)]
@@ -196,22 +199,22 @@ impl Leaf for Backward<'_> {
                 let ((da, db), (dc, dd)) =
                     (dtop.split_at_mut(channels), dbottom.split_at_mut(channels));
                 let from = [a, b, c, d, dy].map(<[f32]>::as_ptr);
-                let to = [da, db, dc, dd].map(<[f32]>::as_mut_ptr);
+                let target = [da, db, dc, dd].map(<[f32]>::as_mut_ptr);
                 // SAFETY: all nine have `channels` values, and `at + n` is at most that.
                 unsafe {
-                    let mut at = 0;
-                    while at + S::LANES <= channels {
-                        let [a, b, c, d, dy] = from.map(|p| S::load(p.add(at)));
-                        for (p, v) in to.into_iter().zip(spread::<S>(a, b, c, d, dy)) {
-                            S::store(p.add(at), v);
+                    let mut offset = 0;
+                    while offset + S::LANES <= channels {
+                        let [a, b, c, d, dy] = from.map(|p| S::load(p.add(offset)));
+                        for (p, v) in target.into_iter().zip(spread::<S>(a, b, c, d, dy)) {
+                            S::store(p.add(offset), v);
                         }
-                        at += S::LANES;
+                        offset += S::LANES;
                     }
-                    let n = channels - at;
+                    let n = channels - offset;
                     if n > 0 {
-                        let [a, b, c, d, dy] = from.map(|p| S::load_part(p.add(at), n));
-                        for (p, v) in to.into_iter().zip(spread::<S>(a, b, c, d, dy)) {
-                            S::store_part(p.add(at), n, v);
+                        let [a, b, c, d, dy] = from.map(|p| S::load_part(p.add(offset), n));
+                        for (p, v) in target.into_iter().zip(spread::<S>(a, b, c, d, dy)) {
+                            S::store_part(p.add(offset), n, v);
                         }
                     }
                 }
@@ -225,10 +228,10 @@ impl Leaf for Backward<'_> {
 /// `dy` to the first maximum of `a`, `b` (top) and `c`, `d` (bottom).
 ///
 /// # Safety
-/// The path's instructions.
+/// The machine has the path of `S`.
 #[inline(always)]
 unsafe fn spread<S: Simd>(a: S::V, b: S::V, c: S::V, d: S::V, dy: S::V) -> [S::V; 4] {
-    // SAFETY: the caller's.
+    // SAFETY: guaranteed by the caller.
     unsafe {
         let zero = S::zero();
         let (top, bottom) = (S::greater(b, a, b, a), S::greater(d, c, d, c));
@@ -285,7 +288,7 @@ mod tests {
             .collect()
     }
 
-    /// Values and places of the first maxima.
+    /// Values and positions of the first maxima.
     fn plain(grid: Grid, channels: usize, x: &[f32]) -> Vec<(f32, usize)> {
         let half = grid.halved();
         let mut found = Vec::new();
@@ -293,15 +296,18 @@ mod tests {
             for (py, px) in (0..half.height).flat_map(|py| (0..half.width).map(move |px| (py, px)))
             {
                 for c in 0..channels {
-                    let at = |t: usize| {
+                    let offset = |t: usize| {
                         ((b * grid.height + 2 * py + t / 2) * grid.width + 2 * px + t % 2)
                             * channels
                             + c
                     };
-                    let first = (1..4).fold(
-                        at(0),
-                        |best, t| if x[at(t)] > x[best] { at(t) } else { best },
-                    );
+                    let first = (1..4).fold(offset(0), |best, t| {
+                        if x[offset(t)] > x[best] {
+                            offset(t)
+                        } else {
+                            best
+                        }
+                    });
                     found.push((x[first], first));
                 }
             }
@@ -319,7 +325,7 @@ mod tests {
             expected
                 .iter()
                 .zip(&dy)
-                .for_each(|((_, at), dy)| expected_dx[*at] = *dy);
+                .for_each(|((_, offset), dy)| expected_dx[*offset] = *dy);
             for isa in Isa::available() {
                 let mut y = vec![f32::NAN; expected.len()];
                 forward(isa, grid, &x, &mut y);
@@ -335,16 +341,16 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_number_is_the_maximum_wherever_it_stands() {
+    fn nan_is_the_maximum_at_any_position() {
         let grid = Grid {
             batch: 1,
             height: 2,
             width: 2,
         };
         for isa in Isa::available() {
-            for at in 0..4 {
+            for offset in 0..4 {
                 let mut x = [1.0, f32::INFINITY, 2.0, 3.0];
-                x[at] = f32::NAN;
+                x[offset] = f32::NAN;
                 let mut y = [0.0];
                 forward(isa, grid, &x, &mut y);
                 assert!(y[0].is_nan(), "{isa}: {x:?}");
@@ -356,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    #[cfg_attr(miri, ignore = "minutes long")]
+    #[cfg_attr(miri, ignore = "takes minutes")]
     fn bits_do_not_depend_on_the_threads() {
         let grid = Grid {
             batch: 2,

@@ -1,16 +1,20 @@
-//! The one product of matrices that all convolutions come down to: `C = A B`, A by its values, B and C by vectors.
+//! The matrix product behind all convolutions, `C = A B`. It reads A by values and B and C by
+//! vectors.
 //!
-//! With channels last, a row of A is a pixel and a row of B what an input channel gives to all output channels. The
-//! inner loop multiplies one value of A with a vector of B into an accumulator; a block of rows times columns of
-//! accumulators stays in registers over the whole reduction (Goto and van de Geijn 2008, its innermost two loops; the
-//! outer ones are the callers': their blocks fit a cache as they come).
+//! With channels last, a row of A is a pixel, and a row of B holds the weights from one input
+//! channel to all output channels. The inner loop multiplies one value of A with a vector of B into
+//! an accumulator. A block of accumulators, rows times columns, stays in registers over the whole
+//! reduction.
+//!
+//! These are the innermost two loops of Goto and van de Geijn (2008). The callers run the outer
+//! loops, over blocks that fit a cache.
 
 use crate::simd::Simd;
 
-/// Rows that A must have readable and C writable beyond the asked ones: blocks are computed whole.
+/// Blocks of this many rows are computed whole: A must be readable and C writable for them.
 pub(crate) const ROW_BLOCK: usize = 24;
 
-/// `rows` and what a product may touch beyond them.
+/// `rows` rounded up to whole blocks.
 pub(crate) fn padded_rows(rows: usize) -> usize {
     rows.next_multiple_of(ROW_BLOCK)
 }
@@ -23,16 +27,17 @@ pub(crate) struct Left {
     pub(crate) k_step: usize,
 }
 
-/// A right operand, in panels of [`Simd::COLUMNS`] vectors of columns, the last one narrower.
+/// A right operand, in panels of [`Simd::COLUMNS`] vectors of columns; the last panel may be
+/// narrower.
 #[derive(Clone, Copy)]
 pub(crate) enum Right {
-    /// Panel after panel, each `[k][its columns]`: see [`Panels`].
+    /// Panels one after another, each `[k][columns of the panel]`: see [`Panels`].
     Packed(*const f32),
-    /// Rows as they lie, `step` values apart, readable up to whole vectors.
+    /// Rows in their original layout, `step` values apart, readable up to whole vectors.
     Rows { start: *const f32, step: usize },
 }
 
-/// The columns of a packed right operand: how `columns` are cut into panels.
+/// The division of `columns` of a packed right operand into panels.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Panels {
     /// Columns, rounded up to whole vectors.
@@ -49,7 +54,7 @@ impl Panels {
         }
     }
 
-    /// Where the vector of column `column` of row `k` lies, of `depth` rows.
+    /// Index of the vector at `column` of row `k`, for `depth` rows.
     pub(crate) fn place(self, depth: usize, k: usize, column: usize) -> usize {
         let first = column / self.full * self.full;
         let width = self.full.min(self.padded - first);
@@ -57,12 +62,14 @@ impl Panels {
     }
 }
 
-/// `C = A B`, or `C += A B`: `rows` x `columns`, `depth` products each; C's rows are `c_step` values apart.
+/// `C = A B`, or `C += A B`, of `rows` x `columns` with a reduction over `depth`. The rows of C are
+/// `c_step` values apart.
 ///
 /// # Safety
-/// The machine has the path of `S`. A is readable and C writable for [`padded_rows`]; B and C have whole vectors of columns.
+/// The machine has the path of `S`. A is readable and C writable for [`padded_rows`]; B and C have
+/// whole vectors of columns.
 #[inline(always)]
-#[allow(clippy::too_many_arguments, reason = "a product has this many")]
+#[allow(clippy::too_many_arguments, reason = "the operands of a product")]
 pub(crate) unsafe fn product<S: Simd>(
     rows: usize,
     depth: usize,
@@ -100,7 +107,7 @@ pub(crate) unsafe fn product<S: Simd>(
     }
 }
 
-/// One panel of columns: block after block of `R` rows.
+/// One panel of columns: blocks of `R` rows.
 #[inline(always)]
 #[allow(clippy::too_many_arguments, reason = "as `product`")]
 unsafe fn strip<S: Simd, const R: usize, const V: usize>(

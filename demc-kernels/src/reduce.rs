@@ -4,15 +4,15 @@ use crate::Isa;
 use crate::simd::{self, Leaf, Simd};
 use crate::tasks::{self, TASK};
 
-/// Sums that go on side by side.
+/// Number of independent partial sums.
 const LANES: usize = 16;
 
-/// Sum of the squares of `values`, in float64, where squares of float32 neither overflow nor vanish.
-/// NaN or infinite where a value is.
+/// Sum of the squares of `values` in float64, where squares of float32 neither overflow nor vanish.
+/// NaN or infinite if a value is.
 pub fn sum_of_squares(isa: Isa, values: &[f32]) -> f64 {
     let sums = tasks::map(values.chunks(TASK), |values| {
-        // SAFETY: the leaf has slices only.
-        unsafe { simd::run(isa, Squares { values }) }
+        // SAFETY: the leaf accesses memory through slices only.
+        unsafe { simd::run(isa, SumOfSquares { values }) }
     });
     sums.into_iter().sum()
 }
@@ -20,16 +20,16 @@ pub fn sum_of_squares(isa: Isa, values: &[f32]) -> f64 {
 /// Multiplies `values` by `factor`.
 pub fn scale(isa: Isa, values: &mut [f32], factor: f32) {
     tasks::each(values.chunks_mut(TASK), |values| {
-        // SAFETY: the leaf has slices only.
-        unsafe { simd::run(tasks::streaming(isa), Scale { values, factor }) }
+        // SAFETY: the leaf accesses memory through slices only.
+        unsafe { simd::run(tasks::streaming(isa), ScaleValues { values, factor }) }
     });
 }
 
-struct Squares<'a> {
+struct SumOfSquares<'a> {
     values: &'a [f32],
 }
 
-impl Leaf for Squares<'_> {
+impl Leaf for SumOfSquares<'_> {
     type Out = f64;
 
     #[inline(always)]
@@ -48,12 +48,12 @@ impl Leaf for Squares<'_> {
     }
 }
 
-struct Scale<'a> {
+struct ScaleValues<'a> {
     values: &'a mut [f32],
     factor: f32,
 }
 
-impl Leaf for Scale<'_> {
+impl Leaf for ScaleValues<'_> {
     type Out = ();
 
     #[inline(always)]
@@ -92,9 +92,9 @@ mod tests {
         for isa in Isa::available() {
             assert!(sum_of_squares(isa, &[1e30; 40]) > 3.9e61);
             assert!(sum_of_squares(isa, &[1e-30; 40]) > 3.9e-59);
-            for at in [0, 16, 39] {
+            for offset in [0, 16, 39] {
                 let mut values = vec![1.0; 40];
-                values[at] = f32::NAN;
+                values[offset] = f32::NAN;
                 assert!(sum_of_squares(isa, &values).is_nan());
             }
         }
@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    #[cfg_attr(miri, ignore = "minutes long")]
+    #[cfg_attr(miri, ignore = "takes minutes")]
     fn sums_have_the_same_bits_on_any_number_of_threads() {
         let values = pattern(5 * TASK + 7, 3);
         for isa in Isa::available() {

@@ -1,16 +1,16 @@
-//! The operations once more, as plain loops in float64: what the kernels are tested against, and nothing else.
+//! The operations as plain loops in float64. Only tests use them.
 //!
-//! Maps are channels last, weights as in weight files, as everywhere in this crate.
+//! Maps have their channels last; weights have the layout of weight files.
 
 use crate::Grid;
 
 /// Gradients of a convolution.
 pub struct Gradients {
-    /// By the input.
+    /// With respect to the input.
     pub dx: Vec<f64>,
-    /// By the weight.
+    /// With respect to the weight.
     pub dweight: Vec<f64>,
-    /// By the bias.
+    /// With respect to the bias.
     pub dbias: Vec<f64>,
 }
 
@@ -30,7 +30,8 @@ fn taps3x3(grid: Grid) -> impl Iterator<Item = (usize, usize, usize)> {
     })
 }
 
-/// The same of a 4x4 deconvolution with stride 2 and padding 1 of a `grid`, tap = 4 * row + column.
+/// The same for a 4x4 deconvolution of a `grid` with stride 2 and padding 1, tap = 4 * row +
+/// column.
 fn taps4x4(grid: Grid) -> impl Iterator<Item = (usize, usize, usize)> {
     let Grid {
         batch,
@@ -57,7 +58,7 @@ fn taps4x4(grid: Grid) -> impl Iterator<Item = (usize, usize, usize)> {
     })
 }
 
-/// Rectifies `y` where asked.
+/// Applies ReLU to `y` if `relu`.
 fn rectified(mut y: Vec<f64>, relu: bool) -> Vec<f64> {
     if relu {
         y.iter_mut().for_each(|y| *y = y.max(0.0));
@@ -65,7 +66,7 @@ fn rectified(mut y: Vec<f64>, relu: bool) -> Vec<f64> {
     y
 }
 
-/// A convolution over `(out, in, tap)` triples; `index(o, i, tap)` is the place of a weight.
+/// A convolution over `(out, in, tap)` triples; `index(o, i, tap)` is the index of a weight.
 fn forward(
     taps: impl Iterator<Item = (usize, usize, usize)>,
     out_pixels: usize,
@@ -89,7 +90,7 @@ fn forward(
     y
 }
 
-/// Its gradients for `dy`, the gradient by its output before any ReLU.
+/// The gradients of [`forward`]; `dy` is the gradient with respect to its output before any ReLU.
 fn backward(
     taps: impl Iterator<Item = (usize, usize, usize)>,
     x: &[f64],
@@ -110,10 +111,10 @@ fn backward(
     for (out, input, tap) in taps {
         for o in 0..outputs {
             for i in 0..inputs {
-                let at = index(o, i, tap);
+                let offset = index(o, i, tap);
                 let dy = dy[out * outputs + o];
-                g.dx[input * inputs + i] += weight[at] * dy;
-                g.dweight[at] += x[input * inputs + i] * dy;
+                g.dx[input * inputs + i] += weight[offset] * dy;
+                g.dweight[offset] += x[input * inputs + i] * dy;
             }
         }
     }
@@ -172,7 +173,8 @@ pub fn conv1x1_backward(grid: Grid, x: &[f64], weight: &[f64], dy: &[f64]) -> Gr
     })
 }
 
-/// 4x4 deconvolution, stride 2, padding 1, weight `[in, out, 4, 4]`, from `grid` to `grid.doubled()`.
+/// 4x4 deconvolution, stride 2, padding 1, weight `[in, out, 4, 4]`, from `grid` to
+/// `grid.doubled()`.
 pub fn deconv4x4(grid: Grid, x: &[f64], weight: &[f64], bias: &[f64], relu: bool) -> Vec<f64> {
     let (inputs, outputs) = (grid.channels(x.len()), bias.len());
     let index = |o, i, tap| (i * outputs + o) * 16 + tap;

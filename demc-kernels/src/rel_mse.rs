@@ -1,7 +1,7 @@
-//! The training loss (Eq. 5) of a network's output in gamma space, and its gradient, in one pass.
+//! The training loss (Eq. 5) on the network's output in gamma space, and its gradient, in one pass.
 //!
-//! The power is computed here, in float64: the same bits on every path and platform, exact to 1e-9, and vectorised by
-//! the compiler.
+//! The power is computed here in float64, exact to 1e-9. The bits are the same on every path and
+//! platform, and the compiler vectorises it.
 
 use std::f64::consts::{LN_2, LOG2_E, SQRT_2};
 
@@ -9,16 +9,17 @@ use crate::Isa;
 use crate::simd::{self, Leaf, Simd};
 use crate::tasks::{self, TASK};
 
-/// `1 / pixels * sum (out_gamma^gamma - ref_hdr)^2 / (ref_hdr^2 + epsilon)` over all values (Eq. 5); into `dout` the
-/// gradient by `out_gamma`, which is 0 where that is 0.
+/// `1 / pixels * sum (out_gamma^gamma - ref_hdr)^2 / (ref_hdr^2 + epsilon)` over all values (Eq.
+/// 5). Writes the gradient with respect to `out_gamma` to `dout`; it is 0 where `out_gamma` is 0.
 ///
-/// Outputs are not negative: one that is gives NaN, as do NaN and infinite values, in the loss and in their gradient.
+/// Negative, NaN and infinite outputs make the loss and their gradient non-finite.
 ///
 /// # Shapes
-/// `out_gamma`, `ref_hdr` and `dout` are alike, in any layout; `pixels` is the batch's number of pixels.
+/// `out_gamma`, `ref_hdr` and `dout` have the same shape, in any layout. `pixels` is the number of
+/// pixels of the batch.
 ///
 /// # Panics
-/// Where the lengths differ, or for a gamma below 1 (an infinite gradient at 0) or above 6.
+/// If the lengths differ, or gamma is below 1 (an infinite gradient at 0) or above 6.
 pub fn loss(
     isa: Isa,
     out_gamma: &[f32],
@@ -37,7 +38,7 @@ pub fn loss(
         (1.0..=6.0).contains(&gamma),
         "gamma {gamma} is not between 1 and 6"
     );
-    let rule = Rule {
+    let rule = LossTerm {
         gamma: f64::from(gamma),
         epsilon: f64::from(epsilon),
         share: 1.0 / pixels as f64,
@@ -53,11 +54,11 @@ pub fn loss(
             tasks::map(
                 pieces.zip(dout.chunks_mut(TASK)),
                 |((out, reference), dout)| {
-                    // SAFETY: the leaf has slices only.
+                    // SAFETY: the leaf accesses memory through slices only.
                     unsafe {
                         simd::run(
                             isa,
-                            WithGradient {
+                            LossAndGradient {
                                 rule,
                                 out,
                                 reference,
@@ -69,11 +70,11 @@ pub fn loss(
             )
         }
         None => tasks::map(pieces, |(out, reference)| {
-            // SAFETY: the leaf has slices only.
+            // SAFETY: the leaf accesses memory through slices only.
             unsafe {
                 simd::run(
                     isa,
-                    Alone {
+                    LossOnly {
                         rule,
                         out,
                         reference,
@@ -85,18 +86,18 @@ pub fn loss(
     sums.into_iter().sum::<f64>() * rule.share
 }
 
-/// Sums that go on side by side.
+/// Number of independent partial sums.
 const LANES: usize = 16;
 
 #[derive(Clone, Copy)]
-struct Rule {
+struct LossTerm {
     gamma: f64,
     epsilon: f64,
     share: f64,
 }
 
-impl Rule {
-    /// A value's term of the sum, and its gradient.
+impl LossTerm {
+    /// One value's term of the sum, and its gradient.
     #[inline(always)]
     fn term(self, out: f32, reference: f32) -> (f64, f64) {
         let (out, reference) = (f64::from(out), f64::from(reference));
@@ -110,13 +111,13 @@ impl Rule {
     }
 }
 
-struct Alone<'a> {
-    rule: Rule,
+struct LossOnly<'a> {
+    rule: LossTerm,
     out: &'a [f32],
     reference: &'a [f32],
 }
 
-impl Leaf for Alone<'_> {
+impl Leaf for LossOnly<'_> {
     type Out = f64;
 
     #[inline(always)]
@@ -131,14 +132,14 @@ impl Leaf for Alone<'_> {
     }
 }
 
-struct WithGradient<'a> {
-    rule: Rule,
+struct LossAndGradient<'a> {
+    rule: LossTerm,
     out: &'a [f32],
     reference: &'a [f32],
     dout: &'a mut [f32],
 }
 
-impl Leaf for WithGradient<'_> {
+impl Leaf for LossAndGradient<'_> {
     type Out = f64;
 
     #[inline(always)]
@@ -158,23 +159,26 @@ impl Leaf for WithGradient<'_> {
     }
 }
 
-/// `x^exponent` to 1e-9 for float32 `x` and exponents from 0 to 5; 0 at 0 (1 for exponent 0), NaN below it.
+/// `x^exponent` to 1e-9, for float32 `x` and exponents from 0 to 5. It is 0 at 0 (1 for exponent
+/// 0), and NaN for negative `x`.
 ///
-/// `x = 2^e * m` with m from sqrt(1/2) to sqrt(2), so that the series of log2(m), in `s = (m - 1) / (m + 1)` below
-/// 0.172, and that of 2^r, r from -1/2 to 1/2, are short. No branch: the compiler vectorises loops around it.
+/// `x = 2^e * m` with m from sqrt(1/2) to sqrt(2). This keeps two series short: that of log2(m) in
+/// `s = (m - 1) / (m + 1)` below 0.172, and that of 2^r for r from -1/2 to 1/2. There is no branch,
+/// so the compiler vectorises loops around it.
 #[inline(always)]
 fn power(x: f64, exponent: f64) -> f64 {
-    // Bits of 1: the exponent of float64 has a bias of 1023 and stands above 52 bits of mantissa.
+    // The bits of 1: the exponent of float64 has a bias of 1023 and is stored above 52 bits of
+    // mantissa.
     const ONE: u64 = 1023 << 52;
     const ROOT_HALF: u64 = (SQRT_2 / 2.0).to_bits();
-    /// Added to an integer below 2^51, leaves its bits at the low end of the mantissa.
+    /// Added to an integer below 2^51, this leaves its bits at the low end of the mantissa.
     const SHIFT: f64 = 1.5 * (1u64 << 52) as f64;
 
     let bits = x.to_bits().wrapping_add(ONE - ROOT_HALF);
     let e = f64::from_bits((bits >> 52) | SHIFT.to_bits()) - (SHIFT + 1023.0);
     let m = f64::from_bits((bits & ((1 << 52) - 1)).wrapping_add(ROOT_HALF));
 
-    // ln(m) = 2 (s + s^3/3 + s^5/5 + ...); the first term left out is s^13/13, 5e-11 of the first.
+    // ln(m) = 2 (s + s^3/3 + s^5/5 + ...). The first omitted term is s^13/13, 5e-11 of the first.
     let s = (m - 1.0) / (m + 1.0);
     let s2 = s * s;
     let series = 1.0
@@ -184,7 +188,7 @@ fn power(x: f64, exponent: f64) -> f64 {
 
     let whole = exponent * log2 + SHIFT;
     let n = whole - SHIFT;
-    // exp(z) = 1 + z/1 (1 + z/2 (1 + z/3 (...))); the first term left out is z^9/9!, below 2e-10.
+    // exp(z) = 1 + z/1 (1 + z/2 (1 + z/3 (...))). The first omitted term is z^9/9!, below 2e-10.
     let z = (exponent * log2 - n) * LN_2;
     let mut series = 1.0 + z / 8.0;
     series = 1.0 + z * (1.0 / 7.0) * series;
@@ -196,7 +200,7 @@ fn power(x: f64, exponent: f64) -> f64 {
     series = 1.0 + z * series;
     let scale = f64::from_bits((whole.to_bits() << 52).wrapping_add(ONE));
 
-    // 0, infinity and NaN have no such parts, negative values no power.
+    // 0, infinity and NaN have no such parts; negative values have no power.
     let plain = series * scale;
     let at_zero = if exponent == 0.0 { 1.0 } else { 0.0 };
     let other = if x == 0.0 { at_zero } else { x };
@@ -248,7 +252,7 @@ mod tests {
     #[test]
     fn power_is_that_of_the_standard_library() {
         for exponent in [0.0, 0.5, 1.0, f64::from(2.2f32) - 1.0, 1.4, 5.0] {
-            // Every binade of float32, subnormal ones too.
+            // Every binade of float32, including subnormal ones.
             for i in 0..254 * 8 {
                 let x = f64::from(f32::from_bits((i << 20) + 12345 + i));
                 let (found, expected) = (power(x, exponent), x.powf(exponent));
@@ -313,29 +317,32 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_number_makes_the_loss_and_its_gradient_none() {
+    fn non_finite_values_make_the_loss_and_its_gradient_non_finite() {
         for isa in Isa::available() {
-            for (bad, at) in [
+            for (bad, offset) in [
                 (f32::NAN, 0),
                 (f32::INFINITY, 20),
                 (-1.0, 39),
                 (f32::NAN, 33),
             ] {
                 let (mut out, mut reference) = images(40);
-                out[at] = bad;
+                out[offset] = bad;
                 let mut dout = vec![0.0; 40];
                 let found = loss(isa, &out, &reference, 13, 2.2, 1e-3, Some(&mut dout));
-                assert!(!found.is_finite() && !dout[at].is_finite(), "{isa}: {bad}");
+                assert!(
+                    !found.is_finite() && !dout[offset].is_finite(),
+                    "{isa}: {bad}"
+                );
                 assert!(dout.iter().filter(|d| !d.is_finite()).count() == 1);
-                (out[at], reference[at]) = (1.0, if bad == -1.0 { f32::NAN } else { bad });
+                (out[offset], reference[offset]) = (1.0, if bad == -1.0 { f32::NAN } else { bad });
                 assert!(!loss(isa, &out, &reference, 13, 2.2, 1e-3, None).is_finite());
             }
         }
     }
 
-    /// No fused operations: the same everywhere.
+    /// No operation is fused, so the bits are the same everywhere.
     #[test]
-    #[cfg_attr(miri, ignore = "minutes long")]
+    #[cfg_attr(miri, ignore = "takes minutes")]
     fn bits_depend_neither_on_the_path_nor_on_the_threads() {
         let size = 3 * TASK + 5;
         let (out, reference) = images(size);

@@ -1,29 +1,31 @@
-//! Buffers that are used again: a training step asks for the same sizes every time, and fresh memory costs a page
-//! fault every 4 KiB. Large ones are kept by the allocator, for everybody; small ones here.
+//! Reuse of buffers: a training step asks for the same sizes every time, and fresh memory costs a
+//! page fault every 4 KiB. The allocator keeps large buffers for all users; this module keeps small
+//! ones.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::Mutex;
 
 use crate::memory;
 
-/// A cache line: what buffers are aligned to.
+/// A cache line: the alignment of buffers.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
-struct Line(#[allow(dead_code, reason = "read through a pointer")] [f32; LINE]);
+struct CacheLine(#[allow(dead_code, reason = "read through a pointer")] [f32; LINE]);
 
 /// Values in a cache line.
 const LINE: usize = 16;
 
-static POOL: Mutex<Vec<Vec<Line>>> = Mutex::new(Vec::new());
+static POOL: Mutex<Vec<Vec<CacheLine>>> = Mutex::new(Vec::new());
 
-/// A buffer of float32 on a cache line's boundary, with whatever values its last user left there.
+/// A buffer of float32 that starts at a cache line and holds arbitrary old values.
 pub(crate) struct Scratch {
-    lines: Vec<Line>,
+    lines: Vec<CacheLine>,
     len: usize,
 }
 
 impl Scratch {
-    /// A buffer of `len` values: the smallest returned one that is large enough, else the largest, grown.
+    /// A buffer of `len` values: the smallest returned buffer that is large enough, else the
+    /// largest one, grown.
     pub(crate) fn take(len: usize) -> Self {
         let count = len.div_ceil(LINE);
         // SAFETY: any bits are floats.
@@ -42,7 +44,7 @@ impl Scratch {
         };
         if lines.len() < count {
             lines = Vec::new();
-            lines.resize(count, Line([0.0; LINE]));
+            lines.resize(count, CacheLine([0.0; LINE]));
         }
         Scratch { lines, len }
     }
@@ -58,7 +60,7 @@ impl Scratch {
 impl Drop for Scratch {
     fn drop(&mut self) {
         let lines = std::mem::take(&mut self.lines);
-        if memory::recycles::<Line>(lines.len()) {
+        if memory::recycles::<CacheLine>(lines.len()) {
             return;
         }
         POOL.lock()
@@ -71,7 +73,8 @@ impl Deref for Scratch {
     type Target = [f32];
 
     fn deref(&self) -> &[f32] {
-        // SAFETY: a Line is LINE initialised values without padding, and `len` of them are there.
+        // SAFETY: a `CacheLine` is LINE initialised values without padding, and the buffer has at
+        // least `len` of them.
         unsafe { std::slice::from_raw_parts(self.lines.as_ptr().cast(), self.len) }
     }
 }
@@ -83,11 +86,11 @@ impl DerefMut for Scratch {
     }
 }
 
-/// A pointer that threads may share; what each reads and writes through it is argued where it is used.
+/// A pointer that threads may share. Each use states which values it reads and writes.
 #[derive(Clone, Copy)]
 pub(crate) struct Shared(*mut f32);
 
-// SAFETY: a pointer is a number; uses of it carry their own argument.
+// SAFETY: a pointer is a number; each use states why its accesses are sound.
 unsafe impl Send for Shared {}
 // SAFETY: as above.
 unsafe impl Sync for Shared {}
@@ -97,7 +100,7 @@ impl Shared {
         Shared(slice.as_mut_ptr())
     }
 
-    /// The pointer `values` further on.
+    /// The pointer, advanced by `values`.
     pub(crate) fn offset(self, values: usize) -> Self {
         Shared(self.0.wrapping_add(values))
     }

@@ -1,8 +1,10 @@
-//! Vectors of float32: one trait, one implementation an instruction path, and the switch between them.
+//! Vectors of float32: one trait, one implementation per instruction path, and the selection at run
+//! time.
 //!
-//! A kernel is a [`Leaf`]: code generic over [`Simd`] that runs on one thread. [`run`] compiles it once for each path
-//! (the leaf and all it calls are `#[inline(always)]`, so that they take on the caller's target features) and picks at
-//! run time. Threads are above: target features do not cross into closures that run elsewhere.
+//! A kernel is a [`Leaf`]: code generic over [`Simd`] that runs on one thread. [`run`] compiles it
+//! once per path and selects the path at run time. The leaf and all functions that it calls are
+//! `#[inline(always)]`, so that they inherit the caller's target features. Threads are spawned
+//! outside leaves, because target features do not extend into closures that run elsewhere.
 
 #![allow(clippy::missing_safety_doc, reason = "stated once, at the trait")]
 
@@ -13,25 +15,24 @@ pub(crate) const WIDEST: usize = 16;
 
 /// A vector type and its operations.
 ///
-/// # Safety
-/// Every function needs the instructions of its path, which [`run`] has checked; those on pointers need the values
-/// that they name to be readable or writable. No alignment is asked for.
+/// Every function needs the instructions of its path, which [`run`] checks. Functions on pointers
+/// need their values to be readable or writable, without alignment.
 pub(crate) unsafe trait Simd: Copy + Send + Sync + 'static {
     /// A vector.
     type V: Copy;
     /// Values in a vector.
     const LANES: usize;
-    /// Accumulators of a product that fit into the registers beside its operands.
+    /// Accumulators of a product that fit into the registers besides its operands.
     const ACCUMULATORS: usize;
-    /// Widest block of columns in a product, in vectors.
+    /// Width of the widest block of columns in a product, in vectors.
     const COLUMNS: usize;
 
     unsafe fn splat(x: f32) -> Self::V;
     unsafe fn load(p: *const f32) -> Self::V;
     unsafe fn store(p: *mut f32, v: Self::V);
-    /// The first `n` values (1 to LANES), 0 in the other lanes.
+    /// Loads the first `n` values (1 to LANES); the other lanes are 0.
     unsafe fn load_part(p: *const f32, n: usize) -> Self::V;
-    /// The first `n` lanes (1 to LANES).
+    /// Stores the first `n` lanes (1 to LANES).
     unsafe fn store_part(p: *mut f32, n: usize, v: Self::V);
     unsafe fn add(a: Self::V, b: Self::V) -> Self::V;
     unsafe fn sub(a: Self::V, b: Self::V) -> Self::V;
@@ -51,29 +52,29 @@ pub(crate) unsafe trait Simd: Copy + Send + Sync + 'static {
 
     #[inline(always)]
     unsafe fn zero() -> Self::V {
-        // SAFETY: the caller's.
+        // SAFETY: guaranteed by the caller.
         unsafe { Self::splat(0.0) }
     }
 }
 
-/// A piece of work for one thread.
+/// Work for one thread.
 pub(crate) trait Leaf {
-    /// What it returns.
+    /// The result.
     type Out;
-    /// Does it. Implementations are `#[inline(always)]`.
+    /// Does the work. Implementations are `#[inline(always)]`.
     ///
     /// # Safety
-    /// The machine has the path of `S`, and what the leaf's pointers need.
+    /// The machine has the path of `S`, and the leaf's pointers are valid.
     unsafe fn run<S: Simd>(self) -> Self::Out;
 }
 
 /// Runs `leaf` on `isa`.
 ///
 /// # Safety
-/// What the leaf needs.
+/// As required by the leaf.
 ///
 /// # Panics
-/// Where the machine does not have `isa`.
+/// If the machine does not have `isa`.
 #[inline]
 pub(crate) unsafe fn run<L: Leaf>(isa: Isa, leaf: L) -> L::Out {
     assert!(isa.is_available(), "{isa} is not on this machine");
@@ -91,14 +92,15 @@ pub(crate) unsafe fn run<L: Leaf>(isa: Isa, leaf: L) -> L::Out {
     }
 }
 
-/// Declares functions of an implementation whose bodies are single intrinsics.
+/// Declares functions of an implementation; each body is a single intrinsic.
 macro_rules! ops {
     ($( fn $name:ident($($arg:ident: $ty:ty),*) $(-> $out:ty)? $body:block )*) => {
         $(
             #[inline(always)]
             #[allow(unused_unsafe, reason = "some bodies of the portable path are safe")]
             unsafe fn $name($($arg: $ty),*) $(-> $out)? {
-                // SAFETY: the trait's: the instructions are there and the values that pointers name are accessible.
+                // SAFETY: as stated at the trait: the machine has the instructions, and the
+                // pointers are valid.
                 unsafe { $body }
             }
         )*
@@ -117,13 +119,13 @@ mod x86 {
 
     #[target_feature(enable = "avx512f,avx2,fma")]
     pub(super) unsafe fn avx512<L: Leaf>(leaf: L) -> L::Out {
-        // SAFETY: the caller's.
+        // SAFETY: guaranteed by the caller.
         unsafe { leaf.run::<Avx512>() }
     }
 
     #[target_feature(enable = "avx2,fma")]
     pub(super) unsafe fn avx2<L: Leaf>(leaf: L) -> L::Out {
-        // SAFETY: the caller's.
+        // SAFETY: guaranteed by the caller.
         unsafe { leaf.run::<Avx2>() }
     }
 
@@ -155,7 +157,7 @@ mod x86 {
             fn greater(a: __m512, b: __m512, yes: __m512, no: __m512) -> __m512 {
                 _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(a, b), no, yes)
             }
-            // The instruction returns its second operand where one is NaN.
+            // The instruction returns its second operand if one operand is NaN.
             fn relu(v: __m512) -> __m512 { _mm512_max_ps(_mm512_setzero_ps(), v) }
             fn nan_or(a: __m512, b: __m512) -> __m512 {
                 _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_UNORD_Q>(a, a), b, a)
@@ -198,7 +200,7 @@ mod x86 {
             fn greater(a: __m256, b: __m256, yes: __m256, no: __m256) -> __m256 {
                 _mm256_blendv_ps(no, yes, _mm256_cmp_ps::<_CMP_GT_OQ>(a, b))
             }
-            // The instruction returns its second operand where one is NaN.
+            // The instruction returns its second operand if one operand is NaN.
             fn relu(v: __m256) -> __m256 { _mm256_max_ps(_mm256_setzero_ps(), v) }
             fn nan_or(a: __m256, b: __m256) -> __m256 {
                 _mm256_blendv_ps(b, a, _mm256_cmp_ps::<_CMP_UNORD_Q>(a, a))
@@ -221,7 +223,7 @@ mod neon {
 
     #[target_feature(enable = "neon")]
     pub(super) unsafe fn neon<L: Leaf>(leaf: L) -> L::Out {
-        // SAFETY: the caller's.
+        // SAFETY: guaranteed by the caller.
         unsafe { leaf.run::<Neon>() }
     }
 
@@ -256,7 +258,7 @@ mod neon {
             fn greater(a: float32x4_t, b: float32x4_t, yes: float32x4_t, no: float32x4_t) -> float32x4_t {
                 vbslq_f32(vcgtq_f32(a, b), yes, no)
             }
-            // The instruction returns NaN where an operand is.
+            // The instruction returns NaN if an operand is NaN.
             fn relu(v: float32x4_t) -> float32x4_t { vmaxq_f32(v, vdupq_n_f32(0.0)) }
             fn nan_or(a: float32x4_t, b: float32x4_t) -> float32x4_t { vbslq_f32(vceqq_f32(a, a), b, a) }
             fn interleave(a: float32x4_t, b: float32x4_t) -> [float32x4_t; 2] { [vzip1q_f32(a, b), vzip2q_f32(a, b)] }
@@ -267,7 +269,7 @@ mod neon {
 mod portable {
     use super::Simd;
 
-    /// Four lanes: what SSE2, the least that a 64-bit PC has, and most others hold in a register.
+    /// Four lanes, as in SSE2, which every 64-bit PC has, and as on most other architectures.
     #[derive(Clone, Copy)]
     pub(super) struct Portable;
 
@@ -276,7 +278,7 @@ mod portable {
         std::array::from_fn(|i| f(a[i], b[i]))
     }
 
-    // SAFETY: no instructions are asked for.
+    // SAFETY: it uses no special instructions.
     unsafe impl Simd for Portable {
         type V = [f32; 4];
         const LANES: usize = 4;

@@ -1,4 +1,4 @@
-//! What the tests of all kernels share.
+//! Test helpers for all kernels.
 
 use crate::Grid;
 
@@ -23,7 +23,7 @@ pub(crate) fn grids() -> Vec<Grid> {
     grids.collect()
 }
 
-/// All cases, or the first ones under Miri, which takes a minute for what takes a millisecond.
+/// All cases; only the first ones under Miri, where a millisecond becomes a minute.
 pub(crate) fn few<T>(mut cases: Vec<T>, under_miri: usize) -> Vec<T> {
     if cfg!(miri) {
         cases.truncate(under_miri);
@@ -31,7 +31,7 @@ pub(crate) fn few<T>(mut cases: Vec<T>, under_miri: usize) -> Vec<T> {
     cases
 }
 
-/// Values from -1 to 1 that repeat late.
+/// Values from -1 to 1 with a long period.
 pub(crate) fn pattern(len: usize, seed: u32) -> Vec<f32> {
     let mut state = seed.wrapping_mul(2654435769);
     let next = || {
@@ -45,7 +45,7 @@ pub(crate) fn f64s(x: &[f32]) -> Vec<f64> {
     x.iter().map(|x| f64::from(*x)).collect()
 }
 
-/// Differences of at most `bound` times the largest expected value (at least 1).
+/// Asserts that differences are at most `bound` times the largest expected value (at least 1).
 pub(crate) fn assert_within(name: &str, found: &[f32], expected: &[f64], bound: f64) {
     assert_eq!(found.len(), expected.len(), "{name}");
     let scale = expected.iter().fold(1.0, |m: f64, x| m.max(x.abs()));
@@ -58,12 +58,13 @@ pub(crate) fn assert_within(name: &str, found: &[f32], expected: &[f64], bound: 
     }
 }
 
-/// To 2e-6: some roundings of float32 (6e-8 each) of sums that are ten times their result.
+/// Asserts agreement to 2e-6: a few roundings of float32 (6e-8 each) in sums that are ten times
+/// their result.
 pub(crate) fn assert_close(name: &str, found: &[f32], expected: &[f64]) {
     assert_within(name, found, expected, 2e-6);
 }
 
-/// Checks that `work` returns the same on one, two and three threads.
+/// Asserts that `work` returns the same on one, two and three threads.
 pub(crate) fn same_on_any_number_of_threads<R: PartialEq + Send>(work: impl Fn() -> R + Sync) {
     let on = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
@@ -76,7 +77,7 @@ pub(crate) fn same_on_any_number_of_threads<R: PartialEq + Send>(work: impl Fn()
     );
 }
 
-/// Bits of values, to compare them NaN and all.
+/// The bits of values, to compare them including NaN.
 pub(crate) fn bits(x: &[f32]) -> Vec<u32> {
     x.iter().map(|x| x.to_bits()).collect()
 }

@@ -1,4 +1,5 @@
-//! Every operation checks the length of every slice before it touches one, and says what it expected.
+//! Every operation checks the length of every slice before it accesses one, and states the expected
+//! length.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -14,8 +15,8 @@ const GRID: Grid = Grid {
 /// Pixels of [`GRID`].
 const P: usize = 24;
 
-/// Runs an operation on zeroed slices of `lengths`, which fit, and then with each of them a value longer and a value
-/// shorter, which must panic with a number in its words.
+/// Runs an operation on zeroed slices of `lengths`, which match. Then makes each slice one value
+/// longer or shorter; the operation must panic with a number in its message.
 fn checks<const N: usize>(name: &str, lengths: [usize; N], run: impl Fn(Isa, [&mut [f32]; N])) {
     let panics = |isa, lengths: [usize; N]| {
         let mut slices = lengths.map(|len| vec![0.0f32; len]);
@@ -46,7 +47,7 @@ fn checks<const N: usize>(name: &str, lengths: [usize; N], run: impl Fn(Isa, [&m
 
 #[test]
 fn convolutions() {
-    // Wide, thin in, thin out: each has its own way.
+    // Wide, few inputs, few outputs: each has its own kernel.
     for [i, o] in [[9, 10], [3, 9], [9, 3]] {
         let weight = 9 * i * o;
         for tile in [Tile::F2, Tile::F4] {

@@ -19,7 +19,7 @@ fn on_threads<T: Send>(threads: usize, run: impl FnOnce() -> T + Send) -> T {
     pool.install(run)
 }
 
-/// Asserts that `run` returns the same bits on 1, 2, 3 and 5 threads, for every path.
+/// Asserts that `run` returns the same bits on 1, 2, 3 and 5 threads, on every path.
 fn assert_same(name: &str, run: impl Fn(Isa) -> Vec<Vec<f32>> + Sync) {
     for isa in Isa::available() {
         let bits = |threads| -> Vec<u32> {

@@ -1,7 +1,7 @@
-//! What a network is: the variants (Sec. 3, 4.3, 4.4), the readings of the paper, and their two tables.
+//! The `[model]` table, the variants (Sec. 3, 4.3, 4.4) and the readings of the paper.
 //!
-//! Everything that differs between two networks stands in [`VariantSpec`] or [`ReadingSpec`]; the modules read the
-//! tables and hold no branch on a name. A new variant is a new row.
+//! All differences between networks are in [`VariantSpec`] and [`ReadingSpec`]. The modules read
+//! these tables and do not branch on names. A new variant is a new row.
 
 use std::fmt;
 
@@ -13,77 +13,85 @@ pub const LEVELS: usize = 5;
 /// Factor between the input's and the latent's height and width: 2^5.
 pub const DOWNSAMPLING: usize = 1 << LEVELS;
 
-/// The paper's channels of a level as multiples of the base width, from the full resolution down (latent: 512 at C = 64, Sec. 3.2).
+/// The paper's channels of each level as multiples of the base width, from the full resolution down
+/// (Sec. 3.2: 512 in the latent at C = 64).
 pub const LEVEL_WIDTHS: [usize; LEVELS] = [1, 2, 4, 8, 8];
 
-/// Colour channels in and out.
+/// Colour channels of input and output.
 pub const COLOR_CHANNELS: usize = 3;
 
-/// Feature channels: normal, position, texture at the 1st and at the 2nd intersection, three each (Sec. 3.1).
+/// Feature channels (Sec. 3.1): normal, position, albedo at the first and at the second hit, three
+/// each.
 pub const FEATURE_CHANNELS: usize = 12;
 
-/// Channels of the detail map that the fusion sub-network makes of the features (Sec. 3.2).
+/// Channels of the detail map, the output of the fusion sub-network (Sec. 3.2).
 pub const DETAIL_CHANNELS: usize = 3;
 
-/// Widest base width that a configuration may ask for. Ours: 256 has 686 million parameters, 11 GB with Adam's state and
-/// gradients; more is a slip of the keyboard.
+/// Largest base width of a configuration. Ours: 256 has 685 million parameters, 11 GB with Adam's
+/// state and gradients; a larger value is probably a typing error.
 pub const MAX_WIDTH: usize = 256;
 
-/// Most channels of a level as a multiple of the base width, for the same reason.
+/// Largest number of channels of a level as a multiple of the base width, for the same reason.
 pub const MAX_LEVEL: usize = 16;
 
-/// Which network.
+/// The network's topology.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Variant {
     /// The dual-encoder network (Fig. 3).
     Demc,
-    /// DEMC without the fusion sub-network: the features go straight to their encoder (Sec. 4.3).
+    /// DEMC without the fusion sub-network: the features are the input of their encoder (Sec. 4.3).
     DemcNosn,
     /// The single-encoder network (Fig. 4, Sec. 4.4).
     Semc,
-    /// SEMC without features: an encoder of the noisy colour. Ours, a control: what features bring is what it lacks.
+    /// SEMC without features: one encoder for the noisy colour. Ours: a control that measures what
+    /// the features contribute.
     ColorOnly,
 }
 
-/// Which reading of the paper, where its text and its authors' released model differ.
+/// The reading of the paper where its text and the authors' released model differ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Reading {
     /// The text and Fig. 3.
     Paper,
-    /// The model definition that the authors published.
+    /// The model definition that the authors released.
     Released,
 }
 
-/// How the output convolution starts. The paper prescribes Xavier for encoders and latent only (Sec. 4.2).
+/// Initialisation of the output convolution. The paper specifies Xavier for encoders and latent
+/// only (Sec. 4.2).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Head {
-    /// A nearly flat image: as bias the flat colour with the least loss on the training set, Xavier weights times
-    /// [`crate::init::GREY_HEAD_SCALE`]. Ours: with plain Xavier most outputs fall below zero at once, where ReLU and
-    /// x^2.2 have no gradient. The set's mean colour is no better a start than that: dark pixels own the loss, and on
-    /// the sample it begins at 15 (2.6 for black, 1.7 for the best flat colour) and soon dies.
+    /// A nearly flat image. The bias is the flat colour with the smallest loss on the training set;
+    /// the weights are Xavier times [`crate::init::GREY_HEAD_SCALE`].
+    ///
+    /// Ours: with plain Xavier most outputs start below zero, where ReLU and x^2.2 have no
+    /// gradient. The mean colour of the set is no better, because dark pixels dominate the loss. On
+    /// the sample its loss is 15 (black: 2.6, the best flat colour: 1.7), and the outputs soon die.
     #[default]
     Grey,
-    /// Xavier weights, zero bias, as everywhere else.
+    /// Xavier weights and a zero bias, as for all other convolutions.
     Xavier,
 }
 
-/// How the detail map starts, the output of the fusion sub-network. Its activation is a ReLU: a channel that falls below zero
-/// everywhere has no gradient and stays there.
+/// Initialisation of the detail map, the output of the fusion sub-network. Its activation is a
+/// ReLU, so a channel that is zero everywhere has no gradient and stays zero.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Detail {
-    /// Above zero nearly everywhere: a bias of [`crate::init::OPEN_BIAS`] for the last convolution. Ours: with a bias of zero two of
-    /// the three channels were zero at 97 % of the pixels or more after some hundred steps, whatever the seed.
+    /// Above zero nearly everywhere: the last convolution has a bias of [`crate::init::OPEN_BIAS`].
+    ///
+    /// Ours: with a bias of zero, two of the three channels were zero at 97 % or more of the pixels
+    /// after a few hundred steps. This held for every seed.
     #[default]
     Open,
-    /// A bias of zero, as everywhere else.
+    /// A zero bias, as for all other convolutions.
     Xavier,
 }
 
-/// One of the images that the network sees.
+/// One of the images that an encoder takes as input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Input {
     /// Gamma-compressed noisy colour, 3 channels.
@@ -105,18 +113,25 @@ impl Input {
     }
 }
 
+/// Channels of the concatenation of `inputs`.
+pub fn channels_of(inputs: &[Input]) -> usize {
+    inputs.iter().map(|input| input.channels()).sum()
+}
+
 /// A row of the table of variants.
 #[derive(Debug)]
 pub struct VariantSpec {
     /// Name in configuration files.
     pub name: &'static str,
-    /// What each encoder eats, concatenated over channels in this order. The skips enter the fusion in the order of the
-    /// encoders (Eq. 2: features, then HDR); the last encoder feeds the latent.
+    /// The inputs of each encoder, concatenated over channels in this order. The skips enter the
+    /// fusion in the order of the encoders (Eq. 2: features, then HDR). The last encoder feeds the
+    /// latent.
     pub encoders: &'static [&'static [Input]],
 }
 
 impl VariantSpec {
-    /// Whether the variant has the fusion sub-network: whether somebody eats its detail map.
+    /// Whether the variant has the fusion sub-network: whether an encoder takes the detail map as
+    /// input.
     pub fn has_fusion(&self) -> bool {
         self.encoders
             .iter()
@@ -129,9 +144,9 @@ impl VariantSpec {
 pub struct ReadingSpec {
     /// Name in configuration files.
     pub name: &'static str,
-    /// 3x3 convolutions of each encoder level.
+    /// Number of 3x3 convolutions of each encoder level.
     pub convolutions: [usize; LEVELS],
-    /// After how many convolutions of each level the skip is taken.
+    /// Number of convolutions of each level before its skip.
     pub skip_after: [usize; LEVELS],
     /// Whether latent and deconvolutions have a batch normalisation before their ReLU.
     pub normalised_decoder: bool,
@@ -140,7 +155,7 @@ pub struct ReadingSpec {
 }
 
 impl Variant {
-    /// All variants, in the order of the paper, and the control.
+    /// All variants in the order of the paper, then the control.
     pub const ALL: [Variant; 4] = [
         Variant::Demc,
         Variant::DemcNosn,
@@ -148,7 +163,7 @@ impl Variant {
         Variant::ColorOnly,
     ];
 
-    /// THE table of variants.
+    /// The table of variants.
     pub fn spec(self) -> &'static VariantSpec {
         match self {
             Variant::Demc => &VariantSpec {
@@ -172,10 +187,10 @@ impl Variant {
 }
 
 impl Reading {
-    /// Both readings.
+    /// Both readings of the paper.
     pub const ALL: [Reading; 2] = [Reading::Paper, Reading::Released];
 
-    /// THE table of readings.
+    /// The table of readings.
     pub fn spec(self) -> &'static ReadingSpec {
         match self {
             Reading::Paper => &ReadingSpec {
@@ -196,21 +211,23 @@ impl Reading {
     }
 }
 
-/// The `[model]` table: everything that decides a network's shape and start.
+/// The `[model]` table: the shape and the initialisation of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ModelConfig {
-    /// Which network.
+    /// The network's topology.
     pub variant: Variant,
-    /// Which reading of the paper.
+    /// The reading of the paper.
     pub reading: Reading,
-    /// Base width C (64 in the paper): channels of the fusion sub-network, and the unit of `levels`.
+    /// Base width C (64 in the paper): the channels of the fusion sub-network and the unit of
+    /// `levels`.
     pub width: usize,
-    /// Channels of each level as multiples of the base width, from the full resolution down; the latent has the last level's.
+    /// Channels of each level as multiples of the base width, from the full resolution down. The
+    /// latent has those of the last level.
     pub levels: [usize; LEVELS],
-    /// How the output convolution starts.
+    /// Initialisation of the output convolution.
     pub head: Head,
-    /// How the detail map starts.
+    /// Initialisation of the detail map.
     pub detail: Detail,
 }
 
@@ -228,7 +245,8 @@ impl Default for ModelConfig {
     }
 }
 
-/// What a person calls it: `demc, paper reading, width 32`, and the levels where they are not the paper's.
+/// A short description: `demc, paper reading, width 32`, and the levels if they are not the
+/// paper's.
 impl fmt::Display for ModelConfig {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (variant, reading) = (self.variant.spec().name, self.reading.spec().name);
@@ -246,7 +264,13 @@ impl ModelConfig {
         self.levels.map(|factor| factor * self.width)
     }
 
-    /// Every problem of the values, each as one line that begins with the key.
+    /// Channels of the level below `level`, 0 at the full resolution; below the last one is the
+    /// latent.
+    pub fn channels_below(&self, level: usize) -> usize {
+        self.level_channels()[(level + 1).min(LEVELS - 1)]
+    }
+
+    /// Every problem of the values, as one line each that begins with the key.
     pub fn validate(&self) -> Vec<String> {
         let mut problems = Vec::new();
         if !(1..=MAX_WIDTH).contains(&self.width) {
@@ -255,7 +279,8 @@ impl ModelConfig {
                 "model.width = {width}: must be from 1 to {MAX_WIDTH}"
             ));
         }
-        if self.levels.iter().any(|of| !(1..=MAX_LEVEL).contains(of)) {
+        let valid = 1..=MAX_LEVEL;
+        if !self.levels.iter().all(|factor| valid.contains(factor)) {
             let levels = self.levels;
             problems.push(format!(
                 "model.levels = {levels:?}: each must be from 1 to {MAX_LEVEL}"
@@ -270,7 +295,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_in_files_are_those_of_the_tables() {
+    fn names_in_configurations_are_those_of_the_tables() {
         for variant in Variant::ALL {
             let name = serde_json::to_value(variant).unwrap();
             assert_eq!(name, variant.spec().name);
@@ -282,9 +307,9 @@ mod tests {
     }
 
     #[test]
-    fn only_those_that_eat_a_detail_map_make_one() {
-        let with: Vec<bool> = Variant::ALL.map(|v| v.spec().has_fusion()).to_vec();
-        assert_eq!(with, [true, false, true, false]);
+    fn only_variants_with_a_detail_map_have_a_fusion() {
+        let has_fusion = Variant::ALL.map(|variant| variant.spec().has_fusion());
+        assert_eq!(has_fusion, [true, false, true, false]);
     }
 
     #[test]
@@ -297,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn its_name_tells_levels_that_are_not_the_papers() {
+    fn the_description_lists_levels_other_than_the_papers() {
         let paper = ModelConfig::default();
         assert_eq!(paper.to_string(), "demc, paper reading, width 64");
         let narrow = ModelConfig {

@@ -1,50 +1,32 @@
-//! What a network costs before it is built: trainable values and floating-point operations.
-
-use burn::tensor::Device;
+//! Cost of a network that is not built: trainable values and floating-point operations.
 
 use crate::config::{LEVELS, ModelConfig};
-use crate::denoiser::Denoiser;
-use crate::weights::{Builder, Weight};
+use crate::weights::{Role, Stage, WeightSpec};
 
 /// Floating-point operations of a multiplication with its addition.
 const MULTIPLY_ADD: f64 = 2.0;
 
 impl ModelConfig {
-    /// Name and shape of every weight, in the order of the fields, without a network of this width: each axis is a multiple of
-    /// the width or fixed, so a straight line through those at widths 1 and 2.
-    pub fn weight_shapes(&self) -> Vec<(String, Vec<usize>)> {
-        let [narrow, wide] = [1, 2].map(|width| shapes(&ModelConfig { width, ..*self }));
-        let line = |(a, b): (&usize, &usize)| a + (b - a) * (self.width - 1);
-        let weights = narrow.into_iter().zip(wide);
-        weights
-            .map(|(a, b)| (a.name, a.shape.iter().zip(&b.shape).map(line).collect()))
-            .collect()
-    }
-
-    /// Number of trainable values: what [`Denoiser::parameter_count`] counts, without a network of this width.
+    /// Number of trainable values.
     pub fn parameter_count(&self) -> u64 {
-        let count = |config: &ModelConfig| {
-            let shapes = shapes(config).into_iter();
-            let trainable = shapes.filter(|weight| weight.is_trainable());
-            trainable.map(|weight| volume(&weight)).sum::<f64>()
-        };
-        self.at_any_width(count).round() as u64
+        let specs = self.weight_specs().into_iter();
+        let trainable = specs.filter(|spec| spec.is_trainable());
+        trainable.map(|spec| spec.len() as u64).sum()
     }
 
-    /// Floating-point operations of a forward pass for each pixel of the image: those of convolutions and deconvolutions, a
-    /// multiplication and an addition counting as two, by the plain sums (Winograd needs fewer).
+    /// Floating-point operations of a forward pass per pixel of the image.
+    ///
+    /// Convolutions and deconvolutions are counted as plain sums, a multiplication with its
+    /// addition as two operations. (Winograd needs fewer.)
     pub fn flops_per_pixel(&self) -> f64 {
-        let count = |config: &ModelConfig| {
-            let shapes = shapes(config).into_iter();
-            let kernels = shapes.filter(|weight| weight.shape.len() == 4);
-            kernels
-                .map(|weight| MULTIPLY_ADD * volume(&weight) * share_of_pixels(&weight.name))
-                .sum::<f64>()
-        };
-        self.at_any_width(count)
+        let specs = self.weight_specs().into_iter();
+        let kernels = specs.filter(|spec| spec.rows().is_some());
+        kernels
+            .map(|spec| MULTIPLY_ADD * spec.len() as f64 * share_of_pixels(&spec))
+            .sum()
     }
 
-    /// The width at which this network has nearest to `parameters` trainable values.
+    /// The width with the number of trainable values that is nearest to `parameters`.
     pub fn width_for(&self, parameters: u64) -> usize {
         let widths = 1..=crate::config::MAX_WIDTH;
         let distance = |width: &usize| {
@@ -56,52 +38,16 @@ impl ModelConfig {
         };
         widths.min_by_key(distance).expect("there are widths")
     }
-
-    /// What `count` finds at this width: all channels are multiples of the width or fixed, so every count is a quadratic
-    /// polynomial of it, through what it finds at widths 1, 2 and 3.
-    fn at_any_width(&self, count: impl Fn(&ModelConfig) -> f64) -> f64 {
-        let [a, b, c] = [1, 2, 3].map(|width| count(&ModelConfig { width, ..*self }));
-        let w = self.width as f64 - 1.0;
-        a + (b - a) * w + (c - 2.0 * b + a) * w * (w - 1.0) / 2.0
-    }
 }
 
-/// Names and shapes of all weights; no values.
-fn shapes(config: &ModelConfig) -> Vec<Weight> {
-    let mut shapes = Vec::new();
-    let mut source = |name: &str, shape: &[usize], _| {
-        shapes.push(Weight {
-            name: name.into(),
-            shape: shape.into(),
-            data: Vec::new(),
-        });
-        Ok(vec![0.0; shape.iter().product()])
-    };
-    let device = Device::flex();
-    let mut builder = Builder::new(&mut source, &device);
-    Denoiser::build(&mut builder, config, [0.0; 3]).expect("zeros have the shape asked for");
-    shapes
-}
-
-fn volume(weight: &Weight) -> f64 {
-    weight.shape.iter().product::<usize>() as f64
-}
-
-/// Pixels that a kernel is applied to, as a share of the image's: each level has a quarter of those above it. Deconvolutions
-/// are applied to what lies below their level.
-fn share_of_pixels(name: &str) -> f64 {
-    let mut parts = name.split('.');
-    let number = |part: Option<&str>| part.and_then(|part| part.parse().ok()).unwrap_or(0);
-    let level = match parts.next() {
-        // encoders.E.levels.L
-        Some("encoders") => number(parts.nth(2)),
-        Some("latent") => LEVELS,
-        // decoder.levels.K.deconv, K from the deepest up
-        Some("decoder") if parts.next() == Some("levels") => {
-            let level = LEVELS - 1 - number(parts.next());
-            level + usize::from(parts.next() == Some("deconv"))
-        }
-        _ => 0,
+/// The pixels to which a kernel is applied, as a share of the image's. Each level has a quarter of
+/// the pixels of the level above. A deconvolution is applied to the level below its own.
+fn share_of_pixels(spec: &WeightSpec) -> f64 {
+    let level = match spec.stage {
+        Stage::Fusion | Stage::Head => 0,
+        Stage::Encoder { level, .. } => level,
+        Stage::Latent => LEVELS,
+        Stage::Decoder { level } => level + usize::from(spec.role == Role::Deconvolution),
     };
     0.25f64.powi(level as i32)
 }
@@ -110,6 +56,9 @@ fn share_of_pixels(name: &str) -> f64 {
 mod tests {
     use super::*;
     use crate::config::{Reading, Variant};
+    use burn::tensor::Device;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
 
     fn config(variant: Variant, reading: Reading, width: usize) -> ModelConfig {
         ModelConfig {
@@ -120,7 +69,7 @@ mod tests {
         }
     }
 
-    /// Counted from the paper's text and from the authors' model (network.md); see also `tests/network.rs`.
+    /// Counted from the paper's text and from the authors' model (docs/network.md).
     #[test]
     fn parameters_are_those_of_the_paper() {
         for (variant, reading, width, expected) in [
@@ -143,7 +92,7 @@ mod tests {
 
     /// Color-only at width 1, layer by layer.
     #[test]
-    fn operations_are_those_of_a_sum_by_hand() {
+    fn operations_agree_with_a_sum_by_hand() {
         let widths = [1.0, 2.0, 4.0, 8.0, 8.0];
         let share = |level: i32| 0.25f64.powi(level);
         let mut expected = 9.0 * 8.0 * 8.0 * share(5);
@@ -162,28 +111,126 @@ mod tests {
         assert!((found - 2.0 * expected).abs() < 1e-9 * found, "{found}");
     }
 
-    #[test]
-    fn any_width_is_counted_as_if_it_was_built() {
+    fn every_network(check: impl Fn(ModelConfig)) {
         for variant in Variant::ALL {
             for reading in Reading::ALL {
-                let wide = ModelConfig {
-                    levels: [1, 3, 4, 2, 5],
-                    ..config(variant, reading, 7)
-                };
-                let named = |w: Weight| (w.name, w.shape);
-                let expected: Vec<_> = shapes(&wide).into_iter().map(named).collect();
-                assert_eq!(wide.weight_shapes(), expected);
-                let built: f64 = shapes(&wide)
-                    .iter()
-                    .filter(|weight| weight.is_trainable())
-                    .map(volume)
-                    .sum();
-                assert_eq!(
-                    wide.parameter_count(),
-                    built as u64,
-                    "{variant:?} {reading:?}"
-                );
+                for width in [1, 3, 7] {
+                    check(ModelConfig {
+                        levels: [1, 3, 4, 2, 5],
+                        ..config(variant, reading, width)
+                    });
+                }
             }
         }
+    }
+
+    #[test]
+    fn specs_have_the_names_and_shapes_of_the_built_network() {
+        every_network(|config| {
+            let mut rng = ChaCha8Rng::seed_from_u64(1);
+            let built = config.init(&mut rng, [0.0; 3], &Device::flex()).weights();
+            let specs = config.weight_specs();
+            assert_eq!(specs.len(), built.len(), "{config}");
+            let mut trainable = 0;
+            for (spec, weight) in specs.iter().zip(&built) {
+                assert_eq!((&spec.name, &spec.shape), (&weight.name, &weight.shape));
+                assert_eq!(spec.len(), weight.data.len(), "{}", spec.name);
+                if spec.is_trainable() {
+                    trainable += weight.data.len() as u64;
+                }
+            }
+            assert_eq!(config.parameter_count(), trainable, "{config}");
+        });
+    }
+
+    /// The stage that a weight's name spells.
+    fn stage_of_name(name: &str) -> Stage {
+        let parts: Vec<&str> = name.split('.').collect();
+        let number = |part: &str| part.parse::<usize>().expect("an index");
+        match parts[..] {
+            ["fusion", ..] => Stage::Fusion,
+            ["encoders", encoder, "levels", level, ..] => Stage::Encoder {
+                encoder: number(encoder),
+                level: number(level),
+            },
+            ["latent", ..] => Stage::Latent,
+            ["decoder", "levels", index, ..] => Stage::Decoder {
+                level: LEVELS - 1 - number(index),
+            },
+            ["decoder", "head", ..] => Stage::Head,
+            _ => panic!("{name}"),
+        }
+    }
+
+    /// The role that a weight's name spells.
+    fn role_of_name(name: &str) -> Role {
+        match name.rsplit('.').next().expect("a name") {
+            "weight" if name.contains("deconv") => Role::Deconvolution,
+            "weight" => Role::Convolution,
+            "bias" => Role::Bias,
+            "gamma" => Role::NormScale,
+            "beta" => Role::NormShift,
+            "running_mean" => Role::RunningMean,
+            "running_var" => Role::RunningVariance,
+            _ => panic!("{name}"),
+        }
+    }
+
+    #[test]
+    fn specs_have_the_roles_and_stages_that_their_names_spell() {
+        every_network(|config| {
+            for spec in config.weight_specs() {
+                assert_eq!(spec.stage, stage_of_name(&spec.name), "{}", spec.name);
+                assert_eq!(spec.role, role_of_name(&spec.name), "{}", spec.name);
+            }
+        });
+    }
+
+    /// The roles and stages of a small network, by hand.
+    #[test]
+    fn specs_have_the_roles_and_stages_of_the_paper() {
+        let specs = config(Variant::DemcNosn, Reading::Released, 1).weight_specs();
+        let count = |role, stage| {
+            let matches = specs
+                .iter()
+                .filter(|spec| (spec.role, spec.stage) == (role, stage));
+            matches.count()
+        };
+        for (encoder, level, convolutions) in [(0, 0, 2), (0, 4, 3), (1, 1, 2), (1, 4, 3)] {
+            let stage = Stage::Encoder { encoder, level };
+            assert_eq!(count(Role::Convolution, stage), convolutions, "{stage:?}");
+            assert_eq!(count(Role::Bias, stage), convolutions, "{stage:?}");
+        }
+        for level in 0..LEVELS {
+            let stage = Stage::Decoder { level };
+            assert_eq!(count(Role::Deconvolution, stage), 1);
+            assert_eq!(count(Role::Convolution, stage), 1, "the skip fusion");
+            assert_eq!(count(Role::RunningVariance, stage), 1);
+        }
+        assert_eq!(count(Role::NormScale, Stage::Latent), 1);
+        assert_eq!(count(Role::Convolution, Stage::Head), 1);
+        assert!(specs.iter().all(|spec| spec.stage != Stage::Fusion));
+        let deepest = specs
+            .iter()
+            .find(|spec| spec.name == "decoder.levels.0.deconv.weight");
+        let deepest = deepest.expect("a decoder");
+        assert_eq!(deepest.stage, Stage::Decoder { level: 4 });
+        assert_eq!((deepest.rows(), deepest.fan_in()), (Some(8), 8 * 4));
+        assert_eq!(deepest.layer(), "decoder.levels.0.deconv");
+        let fusion = specs
+            .iter()
+            .find(|spec| spec.name == "decoder.levels.0.fuse.weight");
+        let fusion = fusion.expect("a skip fusion");
+        assert_eq!((fusion.rows(), fusion.fan_in()), (Some(8), 3 * 8));
+        for spec in specs.iter().filter(|spec| spec.shape.len() == 1) {
+            assert_eq!((spec.rows(), spec.fan_in()), (None, 1), "{}", spec.name);
+        }
+    }
+
+    /// Counted by hand, layer by layer.
+    #[test]
+    fn the_widest_network_is_described_without_its_values() {
+        let widest = config(Variant::Demc, Reading::Paper, crate::config::MAX_WIDTH);
+        assert_eq!(widest.parameter_count(), 685_414_150);
     }
 }

@@ -1,4 +1,4 @@
-//! The decoder (Sec. 3.2): five deconvolutions from the latent up, the encoders' skips fused at each level (Eq. 2).
+//! The decoder (Sec. 3.2): five deconvolutions, each followed by the fusion of the skips (Eq. 2).
 
 use burn::module::Module;
 use burn::nn::BatchNorm;
@@ -8,14 +8,14 @@ use crate::config::{COLOR_CHANNELS, Head, LEVELS, ModelConfig};
 use crate::init::{GREY_HEAD_SCALE, Init};
 use crate::layers::{conv3x3, deconv4x4, norm, skip_fusion};
 use crate::ops::{Activation, Maps};
-use crate::weights::{Builder, WeightsError};
+use crate::weights::{Builder, Stage, WeightsError};
 
 /// Five levels from the deepest to the full resolution, and the output convolution.
 #[derive(Module, Debug)]
 pub struct Decoder {
     /// The levels; index 0 is the deepest, at H/16 x W/16.
     pub levels: Vec<DecoderLevel>,
-    /// 3x3 convolution to colour; a ReLU follows.
+    /// The 3x3 convolution to colour, followed by a ReLU.
     pub head: Conv2d,
 }
 
@@ -30,14 +30,15 @@ impl Decoder {
         let parts = 1 + config.variant.spec().encoders.len();
         let levels = b.list("levels", LEVELS, |b, k| {
             let level = LEVELS - 1 - k;
-            let below = channels[(level + 1).min(LEVELS - 1)];
-            DecoderLevel::build(b, config, [below, channels[level]], parts)
+            b.enter(Stage::Decoder { level });
+            let channels = [config.channels_below(level), channels[level]];
+            DecoderLevel::build(b, config, channels, parts)
         })?;
         let (weight, bias) = match config.head {
             Head::Grey => (Init::Xavier(GREY_HEAD_SCALE), Init::Color(head_bias)),
             Head::Xavier => (Init::Xavier(1.0), Init::Zeros),
         };
-        let head = b.part("head", |b| {
+        let head = b.enter(Stage::Head).part("head", |b| {
             conv3x3(b, [channels[0], COLOR_CHANNELS], weight, bias)
         })?;
         Ok(Decoder { levels, head })
@@ -45,10 +46,11 @@ impl Decoder {
 
     /// Decodes a latent to an image.
     ///
-    /// `skips` holds one list a level from the deepest up, with one entry an encoder.
+    /// `skips` has one list per level from the deepest up, with one entry per encoder.
     ///
     /// # Shapes
-    /// Latent `[B, K_5, H / 32, W / 32]`, skips of level k `[B, K, H / 2^(4 - k), W / 2^(4 - k)]`, to `[B, 3, H, W]`, not negative.
+    /// Latent `[B, K_5, H / 32, W / 32]`, skips of level k `[B, K, H / 2^(4 - k), W / 2^(4 - k)]`,
+    /// to `[B, 3, H, W]`, not negative.
     pub fn forward(&self, latent: Maps, skips: Vec<Vec<Maps>>) -> Maps {
         let image = self
             .levels
@@ -62,11 +64,11 @@ impl Decoder {
 /// One up-sampling unit with its skip fusion.
 #[derive(Module, Debug)]
 pub struct DecoderLevel {
-    /// 4x4 deconvolution, stride 2.
+    /// The 4x4 deconvolution with stride 2.
     pub deconv: ConvTranspose2d,
     /// The normalisation before the deconvolution's ReLU (released reading).
     pub norm: Option<BatchNorm>,
-    /// 1x1 convolution of `[decoder | skips]` to the level's channels.
+    /// The 1x1 convolution of `[decoder | skips]` to the level's channels.
     pub fuse: Conv2d,
     /// Whether a ReLU follows the fusion.
     #[module(skip)]
@@ -92,7 +94,7 @@ impl DecoderLevel {
         })
     }
 
-    /// Up-samples what lies below and fuses the skips into it (Eq. 2).
+    /// Up-samples the maps of the level below and fuses the skips into them (Eq. 2).
     ///
     /// # Shapes
     /// `[B, below, H, W]` and skips `[B, K, 2H, 2W]` to `[B, K, 2H, 2W]`.

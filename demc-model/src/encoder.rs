@@ -1,4 +1,4 @@
-//! An encoder (Sec. 3.2): five levels of 3x3 convolutions, each followed by a 2x2 max-pooling, a skip taken at each.
+//! An encoder (Sec. 3.2): five levels of 3x3 convolutions with a skip and a 2x2 max-pooling each.
 
 use burn::module::Module;
 use burn::nn::conv::Conv2d;
@@ -7,7 +7,7 @@ use crate::config::{LEVELS, ModelConfig};
 use crate::init::Init;
 use crate::layers::conv3x3;
 use crate::ops::{Activation, Maps};
-use crate::weights::{Builder, WeightsError};
+use crate::weights::{Builder, Stage, WeightsError};
 
 /// Five levels, from the full resolution down.
 #[derive(Module, Debug)]
@@ -16,26 +16,29 @@ pub struct Encoder {
     pub levels: Vec<EncoderLevel>,
 }
 
-/// What an encoder hands to the decoder.
+/// The output of an encoder.
 #[derive(Debug)]
-pub struct Encoded {
-    /// One a level, `[B, K_i, H / 2^i, W / 2^i]` for i = 0..5, K_i the level's channels.
+pub struct EncoderOutput {
+    /// One skip per level, `[B, K_i, H / 2^i, W / 2^i]` for i = 0..5, K_i the level's channels.
     pub skips: Vec<Maps>,
-    /// What lies below the last level, `[B, K_5, H / 32, W / 32]`: the latent's input, where the encoder computes it.
+    /// The input of the latent, `[B, K_5, H / 32, W / 32]`, if this encoder computes it.
     pub bottom: Option<Maps>,
 }
 
 impl Encoder {
-    /// An encoder of `input` channels. Only one that `feeds_latent` has parameters after its last skip.
+    /// The encoder with index `encoder` in the table of variants, for `input` channels. Only the
+    /// last encoder feeds the latent; the others have no parameters after their last skip.
     pub(crate) fn build(
         b: &mut Builder,
         config: &ModelConfig,
+        encoder: usize,
         input: usize,
-        feeds_latent: bool,
     ) -> Result<Self, WeightsError> {
         let spec = config.reading.spec();
         let channels = config.level_channels();
+        let feeds_latent = encoder + 1 == config.variant.spec().encoders.len();
         let levels = b.list("levels", LEVELS, |b, i| {
+            b.enter(Stage::Encoder { encoder, level: i });
             let skip_after = spec.skip_after[i];
             let pooled = feeds_latent || i + 1 < LEVELS;
             let count = if pooled {
@@ -63,17 +66,17 @@ impl Encoder {
     /// Encodes an image.
     ///
     /// # Shapes
-    /// `[B, input, H, W]`, H and W multiples of 32, to [`Encoded`].
-    pub fn forward(&self, image: Maps) -> Encoded {
+    /// `[B, input, H, W]`, H and W multiples of 32, to [`EncoderOutput`].
+    pub fn forward(&self, image: Maps) -> EncoderOutput {
         let mut skips = Vec::with_capacity(LEVELS);
         let mut x = Some(image);
         for level in &self.levels {
-            let input = x.take().expect("only the last level has nothing below it");
+            let input = x.take().expect("all levels but the last are pooled");
             let (skip, below) = level.forward(input);
             skips.push(skip);
             x = below;
         }
-        Encoded { skips, bottom: x }
+        EncoderOutput { skips, bottom: x }
     }
 }
 
@@ -82,10 +85,10 @@ impl Encoder {
 pub struct EncoderLevel {
     /// The convolutions, each followed by a ReLU.
     pub convs: Vec<Conv2d>,
-    /// After how many of them the skip is taken.
+    /// Number of convolutions before the skip.
     #[module(skip)]
     pub skip_after: usize,
-    /// Whether anything lies below.
+    /// Whether the level has a max-pooling and a level below.
     #[module(skip)]
     pub pooled: bool,
 }

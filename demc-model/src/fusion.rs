@@ -1,4 +1,5 @@
-//! The feature fusion sub-network (Sec. 3.2): twelve feature channels to a three-channel detail map (Fig. 2 e).
+//! The feature fusion sub-network (Sec. 3.2): twelve feature channels to a detail map of three
+//! (Fig. 2 e).
 
 use burn::module::Module;
 
@@ -7,11 +8,6 @@ use crate::init::{Init, OPEN_BIAS};
 use crate::layers::ConvBlock;
 use crate::ops::Maps;
 use crate::weights::{Builder, WeightsError};
-
-/// Blocks of the sub-network.
-pub const BLOCKS: usize = 4;
-/// Path of the convolution whose three channels are the detail map: the last block's.
-pub const DETAIL_LAYER: &str = "fusion.blocks.3.conv";
 
 /// Four convolutional blocks; the two in the middle are batch normalised.
 #[derive(Module, Debug)]
@@ -26,15 +22,15 @@ impl Fusion {
         width: usize,
         detail: Detail,
     ) -> Result<Self, WeightsError> {
-        let start = match detail {
+        let bias = match detail {
             Detail::Open => Init::Color([OPEN_BIAS; DETAIL_CHANNELS]),
             Detail::Xavier => Init::Zeros,
         };
-        let blocks: [_; BLOCKS] = [
+        let blocks = [
             ([FEATURE_CHANNELS, width], false, Init::Zeros),
             ([width, width], true, Init::Zeros),
             ([width, width], true, Init::Zeros),
-            ([width, DETAIL_CHANNELS], false, start),
+            ([width, DETAIL_CHANNELS], false, bias),
         ];
         Ok(Fusion {
             blocks: b.list("blocks", blocks.len(), |b, i| {
@@ -44,7 +40,7 @@ impl Fusion {
         })
     }
 
-    /// Fuses Z-scored features to the detail map.
+    /// The detail map of Z-scored features.
     ///
     /// # Shapes
     /// `[B, 12, H, W]` to `[B, 3, H, W]`.

@@ -1,30 +1,32 @@
-//! Initial weights as pure functions (Sec. 4.2): Xavier, the bilinear deconvolution, the identity skip fusion.
+//! Initial weights as pure functions (Sec. 4.2): Xavier, the bilinear deconvolution, the identity
+//! skip fusion.
 //!
-//! Weights are drawn on the host from the caller's generator in the fixed order of the modules, never by the device:
-//! the same seed gives the same network everywhere.
+//! The host initialises the weights from the caller's generator, in the fixed order of the modules.
+//! So a seed gives the same network on every device.
 
 use rand::{Rng, RngExt};
 
-/// Factor on the Xavier weights of a grey head; ours: with 0.1 no output starts below zero.
+/// Factor of the Xavier weights of a grey head. Ours: with 0.1 no output starts below zero.
 pub const GREY_HEAD_SCALE: f32 = 0.1;
 
-/// Bias of the detail map's convolution that starts open; ours: the convolution's output has a deviation of about 1.
+/// Initial bias of an open detail map. Ours: the output of its convolution has a standard deviation
+/// of about 1.
 pub const OPEN_BIAS: f32 = 1.0;
 
-/// How one tensor starts.
+/// Initialisation of one tensor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Init {
-    /// Zero: every bias, the shift of a batch normalisation, its running mean.
+    /// Zero: biases; the shift and the running mean of a batch normalisation.
     Zeros,
-    /// One: the scale of a batch normalisation, its running variance.
+    /// One: the scale and the running variance of a batch normalisation.
     Ones,
     /// Xavier uniform (Glorot and Bengio 2010) times a factor: convolutions.
     Xavier(f32),
-    /// The bilinear up-sampling kernel on `w[j, j]`: deconvolutions.
+    /// The bilinear up-sampling kernel at `w[j, j]`, zero elsewhere: deconvolutions.
     Bilinear,
     /// `[I I I]` (Eq. 3): the skip fusion starts as the sum of its inputs.
     IdentitySum,
-    /// Three given values: the bias of a grey head or an open detail map.
+    /// Three given values: the bias of a grey head or of an open detail map.
     Color([f32; 3]),
 }
 
@@ -32,11 +34,12 @@ impl Init {
     /// The values of a tensor of this shape, row-major.
     ///
     /// # Shapes
-    /// `[out, in, h, w]` for `Xavier` and `IdentitySum`, `[in, out, 4, 4]` for `Bilinear`, `[3]` for `Color`.
+    /// `[out, in, h, w]` for `Xavier` and `IdentitySum`, `[in, out, 4, 4]` for `Bilinear`, `[3]`
+    /// for `Color`.
     ///
     /// # Panics
-    /// Where the shape does not fit: a bug of the module that asks.
-    pub fn draw(self, shape: &[usize], rng: &mut impl Rng) -> Vec<f32> {
+    /// If the shape does not fit, which is a bug of the module that asks.
+    pub fn values(self, shape: &[usize], rng: &mut impl Rng) -> Vec<f32> {
         let len = shape.iter().product();
         match self {
             Init::Zeros => vec![0.0; len],
@@ -52,7 +55,7 @@ impl Init {
     }
 }
 
-/// Uniform in +-sqrt(6 / (fan_in + fan_out)), times `scale`.
+/// Uniform in +-`scale` * sqrt(6 / (fan_in + fan_out)).
 fn xavier(shape: &[usize], scale: f32, rng: &mut impl Rng) -> Vec<f32> {
     let [out, input, height, width] = four(shape);
     let fan_sum = (input + out) * height * width;
@@ -62,7 +65,8 @@ fn xavier(shape: &[usize], scale: f32, rng: &mut impl Rng) -> Vec<f32> {
         .collect()
 }
 
-/// The outer product of [.25 .75 .75 .25] on the diagonal, zero elsewhere (as in hdrcnn, from which the scheme comes).
+/// The outer product of [.25 .75 .75 .25] on the diagonal, zero elsewhere. The scheme is that of
+/// hdrcnn.
 fn bilinear(shape: &[usize]) -> Vec<f32> {
     const TAPS: [f32; 4] = [0.25, 0.75, 0.75, 0.25];
     let [input, out, height, width] = four(shape);
@@ -84,7 +88,7 @@ fn identity_sum(shape: &[usize]) -> Vec<f32> {
     assert_eq!(
         input % out,
         0,
-        "a skip fusion takes whole multiples of its width"
+        "a skip fusion has a multiple of its outputs as inputs"
     );
     let mut weight = vec![0.0; out * input];
     for row in 0..out {
@@ -108,21 +112,22 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     #[test]
-    fn xavier_fills_its_range_and_no_more() {
+    fn xavier_fills_its_range_and_stays_inside() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let weights = Init::Xavier(1.0).draw(&[32, 16, 3, 3], &mut rng);
+        let weights = Init::Xavier(1.0).values(&[32, 16, 3, 3], &mut rng);
         let bound = (6.0f32 / (48.0 * 9.0)).sqrt();
         let largest = weights.iter().fold(0.0f32, |m, w| m.max(w.abs()));
         assert!(largest <= bound && largest > 0.99 * bound);
         let mean: f32 = weights.iter().sum::<f32>() / weights.len() as f32;
-        // The mean of 4608 uniform values has a deviation of bound / sqrt(3 * 4608) = 0.0085 bounds; 5 of them.
+        // The mean of 4608 uniform values has a deviation of bound / sqrt(3 * 4608) = 0.0085 bound.
+        // The tolerance is 5 deviations.
         assert!(mean.abs() < 0.043 * bound, "mean {mean}");
     }
 
     #[test]
     fn bilinear_kernel_sums_to_four_and_stays_on_the_diagonal() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let weights = Init::Bilinear.draw(&[3, 2, 4, 4], &mut rng);
+        let weights = Init::Bilinear.values(&[3, 2, 4, 4], &mut rng);
         for (block, kernel) in weights.chunks(16).enumerate() {
             let (input, out) = (block / 2, block % 2);
             let expected = if input == out { 4.0 } else { 0.0 };
@@ -135,7 +140,7 @@ mod tests {
     #[test]
     fn identity_sum_is_a_row_of_identities() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let weights = Init::IdentitySum.draw(&[2, 6, 1, 1], &mut rng);
+        let weights = Init::IdentitySum.values(&[2, 6, 1, 1], &mut rng);
         assert_eq!(weights, [1., 0., 1., 0., 1., 0., 0., 1., 0., 1., 0., 1.]);
     }
 }

@@ -1,7 +1,7 @@
-//! The four kinds of layer that the network is made of, with the paper's settings, around Burn's own modules.
+//! The four kinds of layer of the network: Burn's modules with the paper's settings.
 //!
-//! Burn's defaults differ from the paper's network (a random bias under Xavier, batch normalisation with epsilon 1e-5
-//! and momentum 0.1), so everything is written out here, once.
+//! Burn's defaults differ from the paper's network: a random bias under Xavier, batch normalisation
+//! with epsilon 1e-5 and momentum 0.1. So every setting is explicit here.
 
 use burn::module::{Module, Param};
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
@@ -9,25 +9,26 @@ use burn::nn::{BatchNorm, PaddingConfig2d};
 
 use crate::init::Init;
 use crate::ops::{Activation, Maps};
-use crate::weights::{Builder, WeightsError};
+use crate::weights::{Builder, Role, WeightsError};
 
-/// Epsilon of every batch normalisation (the authors' TensorFlow 1.13 default; network.md).
+/// Epsilon of every batch normalisation (the authors' TensorFlow 1.13 default; docs/network.md).
 pub const NORM_EPSILON: f64 = 1e-3;
 
 /// Share of a batch's statistics in the running ones (TensorFlow's momentum of 0.99).
 pub const NORM_MOMENTUM: f64 = 0.01;
 
-/// A 3x3 convolution with padding 1, with or without batch normalisation, and a ReLU: the block of Sec. 3.2.
+/// The block of Sec. 3.2: a 3x3 convolution with padding 1, optional batch normalisation, and a
+/// ReLU.
 #[derive(Module, Debug)]
 pub struct ConvBlock {
     /// The convolution, with bias.
     pub conv: Conv2d,
-    /// The normalisation between convolution and ReLU.
+    /// The normalisation between convolution and ReLU, if there is one.
     pub norm: Option<BatchNorm>,
 }
 
 impl ConvBlock {
-    /// A block from `input` to `output` channels, whose convolution starts with this bias.
+    /// A block with `channels` in and out, whose convolution starts with this bias.
     pub(crate) fn build(
         b: &mut Builder,
         channels: [usize; 2],
@@ -42,7 +43,7 @@ impl ConvBlock {
         })
     }
 
-    /// Convolves, normalises, rectifies.
+    /// Convolution, normalisation, ReLU.
     ///
     /// # Shapes
     /// `[B, in, H, W]` to `[B, out, H, W]`.
@@ -66,7 +67,7 @@ pub(crate) fn conv3x3(
     conv(b, channels, 3, weight, bias)
 }
 
-/// The 1x1 convolution of a skip fusion (Eq. 2), started as the sum of its inputs (Eq. 3).
+/// The 1x1 convolution of a skip fusion (Eq. 2), initialised as the sum of its inputs (Eq. 3).
 pub(crate) fn skip_fusion(b: &mut Builder, channels: [usize; 2]) -> Result<Conv2d, WeightsError> {
     conv(b, channels, 1, Init::IdentitySum, Init::Zeros)
 }
@@ -79,8 +80,13 @@ fn conv(
     bias: Init,
 ) -> Result<Conv2d, WeightsError> {
     Ok(Conv2d {
-        weight: b.parameter("weight", [output, input, kernel, kernel], weight)?,
-        bias: Some(b.parameter("bias", [output], bias)?),
+        weight: b.parameter(
+            "weight",
+            Role::Convolution,
+            [output, input, kernel, kernel],
+            weight,
+        )?,
+        bias: Some(b.parameter("bias", Role::Bias, [output], bias)?),
         stride: [1, 1],
         kernel_size: [kernel, kernel],
         dilation: [1, 1],
@@ -89,14 +95,20 @@ fn conv(
     })
 }
 
-/// The 4x4 deconvolution with stride 2 and padding 1: exactly twice the size (Sec. 3.2), started bilinear (Sec. 4.2).
+/// The 4x4 deconvolution with stride 2 and padding 1: exactly twice the size (Sec. 3.2),
+/// initialised as bilinear up-sampling (Sec. 4.2).
 pub(crate) fn deconv4x4(
     b: &mut Builder,
     [input, output]: [usize; 2],
 ) -> Result<ConvTranspose2d, WeightsError> {
     Ok(ConvTranspose2d {
-        weight: b.parameter("weight", [input, output, 4, 4], Init::Bilinear)?,
-        bias: Some(b.parameter("bias", [output], Init::Zeros)?),
+        weight: b.parameter(
+            "weight",
+            Role::Deconvolution,
+            [input, output, 4, 4],
+            Init::Bilinear,
+        )?,
+        bias: Some(b.parameter("bias", Role::Bias, [output], Init::Zeros)?),
         stride: [2, 2],
         kernel_size: [4, 4],
         dilation: [1, 1],
@@ -107,14 +119,14 @@ pub(crate) fn deconv4x4(
     })
 }
 
-/// A batch normalisation that starts as the identity.
+/// A batch normalisation, initialised as the identity.
 pub(crate) fn norm(b: &mut Builder, channels: usize) -> Result<BatchNorm, WeightsError> {
     Ok(BatchNorm {
-        gamma: b.parameter("gamma", [channels], Init::Ones)?,
-        beta: b.parameter("beta", [channels], Init::Zeros)?,
+        gamma: b.parameter("gamma", Role::NormScale, [channels], Init::Ones)?,
+        beta: b.parameter("beta", Role::NormShift, [channels], Init::Zeros)?,
         training: Param::from_bool(true),
-        running_mean: b.running_state("running_mean", channels, Init::Zeros)?,
-        running_var: b.running_state("running_var", channels, Init::Ones)?,
+        running_mean: b.running_state("running_mean", Role::RunningMean, channels, Init::Zeros)?,
+        running_var: b.running_state("running_var", Role::RunningVariance, channels, Init::Ones)?,
         momentum: NORM_MOMENTUM,
         epsilon: NORM_EPSILON,
     })

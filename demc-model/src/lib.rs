@@ -1,21 +1,24 @@
-//! The networks of *DEMC: A Deep Dual-Encoder Network for Denoising Monte Carlo Rendering* as Burn modules.
+//! The networks of *DEMC: A Deep Dual-Encoder Network for Denoising Monte Carlo Rendering* as Burn
+//! modules.
 //!
-//! A [`ModelConfig`] names a [`Variant`], a [`Reading`] and a base width; [`ModelConfig::init`] draws the weights of a
-//! new [`Denoiser`], [`ModelConfig::load`] takes those of a trained one. The forward pass reads like Fig. 3 of the paper:
-//! [`fusion`] squeezes twelve feature channels into a detail map, each [`encoder`] halves its input five times, and
-//! the [`decoder`] climbs back from the latent, fusing the encoders' skips on its way.
+//! A [`ModelConfig`] selects a [`Variant`], a [`Reading`] and a base width. [`ModelConfig::init`]
+//! returns a new [`Denoiser`], [`ModelConfig::load`] one with trained weights, and
+//! [`ModelConfig::weight_specs`] describes every weight.
 //!
-//! What the layers compute is one of two implementations of the same operations ([`ops`]): our CPU kernels or Burn's own.
+//! The forward pass follows Fig. 3 of the paper. [`fusion`] reduces twelve feature channels to a
+//! detail map. Each [`encoder`] halves its input five times. The [`decoder`] doubles the latent
+//! five times and fuses the encoders' skips at each level. The layers run on one of two
+//! implementations ([`ops`]): our CPU kernels or Burn's operations.
 //!
-//! Tensors are NCHW, float32; height and width are multiples of [`DOWNSAMPLING`]. Files, statistics and patches are
-//! not known here: see `demc-data`.
+//! Tensors are NCHW and float32; height and width are multiples of [`DOWNSAMPLING`]. `demc-data`
+//! provides files, statistics and patches.
 
 pub mod config;
 mod cost;
 pub mod decoder;
 pub mod denoiser;
-pub mod dormant;
 pub mod encoder;
+mod forward;
 pub mod fusion;
 pub mod inference;
 pub mod init;
@@ -27,6 +30,6 @@ pub mod weights;
 
 pub use config::{DOWNSAMPLING, Detail, Head, ModelConfig, Reading, Variant};
 pub use denoiser::Denoiser;
-pub use loss::Loss;
+pub use loss::LossConfig;
 pub use ops::Ops;
-pub use weights::{Weight, Weights, WeightsError};
+pub use weights::{Role, Stage, Weight, WeightSpec, Weights, WeightsError};

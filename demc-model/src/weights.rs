@@ -1,9 +1,10 @@
-//! Named weights in and out of a network: how modules are built, saved and loaded.
+//! Named weights of a network: how modules are described, built, saved and loaded.
 //!
-//! A module asks a [`Builder`] for each of its tensors by name and shape, in a fixed order. Where they come from is
-//! the builder's affair: drawn ([`crate::init`]) for a new network, taken from [`Weights`] for a trained one. So both
-//! ways share one description of the network, a load is strict by construction, and parameter ids are the same in
-//! every process, which is what lets Adam's state find its parameters after a resume.
+//! A module asks a [`Builder`] for each of its tensors by name, role and shape, in a fixed order.
+//! The builder initialises the values randomly ([`crate::init`]), takes them from [`Weights`], or
+//! only describes the tensor as a [`WeightSpec`]. All three share one description of the network.
+//! So a load is strict, and parameter ids are the same in every process: Adam's state needs that
+//! after a resume.
 
 use std::collections::BTreeMap;
 
@@ -24,41 +25,118 @@ pub struct Weight {
     pub data: Vec<f32>,
 }
 
-/// The inputs that one output sums up in the layer with the weight `name` of this shape: 1 for what is no kernel.
-///
-/// # Shapes
-/// Convolutions `[out, in, h, w]`; deconvolutions `[in, out, h, w]`, whose stride of 2 lets a quarter of the taps reach each output.
-pub fn fan_in(name: &str, shape: &[usize]) -> usize {
-    match *shape {
-        [inputs, _, height, width] if is_deconvolution(name) => inputs * height * width / 4,
-        [_, inputs, height, width] => inputs * height * width,
-        _ => 1,
+/// The kind of value that a tensor holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Role {
+    /// Kernel of a convolution, `[out, in, h, w]`.
+    Convolution,
+    /// Kernel of a deconvolution with stride 2, `[in, out, h, w]`.
+    Deconvolution,
+    /// Bias of a convolution or deconvolution, `[out]`.
+    Bias,
+    /// Scale of a batch normalisation, `[channels]`.
+    NormScale,
+    /// Shift of a batch normalisation, `[channels]`.
+    NormShift,
+    /// Running mean of a batch normalisation, `[channels]`.
+    RunningMean,
+    /// Running variance of a batch normalisation, `[channels]`.
+    RunningVariance,
+}
+
+impl Role {
+    /// Whether the optimizer changes the tensor: false for running statistics.
+    pub fn is_trainable(self) -> bool {
+        !matches!(self, Role::RunningMean | Role::RunningVariance)
+    }
+
+    /// Whether the tensor belongs to a batch normalisation.
+    pub fn is_norm(self) -> bool {
+        matches!(self, Role::NormScale | Role::NormShift) || !self.is_trainable()
     }
 }
 
-/// Outputs of a kernel; `None` for what is no kernel.
-///
-/// # Shapes
-/// As of [`fan_in`].
-pub fn outputs(name: &str, shape: &[usize]) -> Option<usize> {
-    match *shape {
-        [_, outputs, _, _] if is_deconvolution(name) => Some(outputs),
-        [outputs, _, _, _] => Some(outputs),
-        _ => None,
+/// The part of the network (Fig. 3) that a tensor belongs to. Levels count from the full resolution
+/// (0) down.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Stage {
+    /// The feature fusion sub-network.
+    Fusion,
+    /// A level of an encoder.
+    Encoder {
+        /// Index in the table of variants.
+        encoder: usize,
+        /// Level, 0 to 4.
+        level: usize,
+    },
+    /// The latent's convolution.
+    Latent,
+    /// A level of the decoder.
+    Decoder {
+        /// Level, 0 to 4.
+        level: usize,
+    },
+    /// The output convolution.
+    Head,
+}
+
+/// Description of one tensor of a network.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WeightSpec {
+    /// Path of module fields, such as `decoder.levels.0.deconv.weight`.
+    pub name: String,
+    /// Axes, outermost first; see [`Role`].
+    pub shape: Vec<usize>,
+    /// The kind of its values.
+    pub role: Role,
+    /// The part of the network that it belongs to.
+    pub stage: Stage,
+}
+
+#[allow(clippy::len_without_is_empty, reason = "no tensor is empty")]
+impl WeightSpec {
+    /// Number of values.
+    pub fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// Whether the optimizer changes the tensor; see [`Role::is_trainable`].
+    pub fn is_trainable(&self) -> bool {
+        self.role.is_trainable()
+    }
+
+    /// Output channels of a kernel: the rows of its matrix. `None` for all other tensors.
+    pub fn rows(&self) -> Option<usize> {
+        match self.role {
+            Role::Convolution => Some(self.shape[0]),
+            Role::Deconvolution => Some(self.shape[1]),
+            _ => None,
+        }
+    }
+
+    /// Number of inputs that one output of the kernel sums up; 1 for all other tensors.
+    ///
+    /// A deconvolution has stride 2, so a quarter of its taps reach each output.
+    pub fn fan_in(&self) -> usize {
+        match (self.role, &self.shape[..]) {
+            (Role::Convolution, [_, inputs, height, width]) => inputs * height * width,
+            (Role::Deconvolution, [inputs, _, height, width]) => inputs * height * width / 4,
+            _ => 1,
+        }
+    }
+
+    /// Name of the layer: the path without the tensor's own name.
+    pub fn layer(&self) -> &str {
+        self.name.rsplit_once('.').map_or("", |(layer, _)| layer)
     }
 }
 
-/// Whether a layer or weight is a deconvolution's, by its name: its first two axes are the other way round.
-pub(crate) fn is_deconvolution(name: &str) -> bool {
-    name.contains("deconv")
-}
-
-/// The weights of a trained network by name, to be taken one by one.
+/// The weights of a trained network by name, for [`crate::ModelConfig::load`].
 #[derive(Debug, Default)]
 pub struct Weights(BTreeMap<String, Weight>);
 
 impl Weights {
-    /// Collects weights by their names.
+    /// Indexes weights by their names.
     pub fn new(weights: Vec<Weight>) -> Self {
         Weights(
             weights
@@ -83,7 +161,7 @@ impl Weights {
         Ok(weight.data)
     }
 
-    /// Fails if anything has not been taken.
+    /// Fails if a weight has not been taken.
     pub(crate) fn all_taken(&self) -> Result<(), WeightsError> {
         match self.0.keys().next() {
             None => Ok(()),
@@ -95,10 +173,10 @@ impl Weights {
     }
 }
 
-/// Why weights do not make the network that a [`crate::ModelConfig`] describes.
+/// A difference between weights and the network that a [`crate::ModelConfig`] describes.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 pub enum WeightsError {
-    /// A tensor of the network is not there.
+    /// A tensor of the network is missing.
     #[error("weight {name} is missing")]
     Missing {
         /// Name of the tensor.
@@ -114,35 +192,44 @@ pub enum WeightsError {
         /// Shape in the file.
         found: Vec<usize>,
     },
-    /// There are tensors that the network does not have.
-    #[error("weight {name} does not belong to this network ({count} such)")]
+    /// The network does not have these tensors.
+    #[error("weight {name} is not part of this network ({count} such weights)")]
     Unknown {
         /// First of them by name.
         name: String,
-        /// How many there are.
+        /// Number of unknown tensors.
         count: usize,
     },
 }
 
-/// Where a [`Builder`] gets its values.
-type Source<'a> = dyn FnMut(&str, &[usize], Init) -> Result<Vec<f32>, WeightsError> + 'a;
+/// Returns the values of a tensor for a [`Builder`], or `None` if the builder only describes the
+/// network.
+type ValueSource<'a> = dyn FnMut(&WeightSpec, Init) -> Result<Option<Vec<f32>>, WeightsError> + 'a;
 
-/// Hands a module its tensors, by name within the module under construction.
+/// Creates the tensors of the module under construction. Names are relative to the module.
 pub struct Builder<'a> {
-    source: &'a mut Source<'a>,
+    source: &'a mut ValueSource<'a>,
     device: &'a Device,
     path: Vec<String>,
+    stage: Stage,
     next_id: u64,
 }
 
 impl<'a> Builder<'a> {
-    pub(crate) fn new(source: &'a mut Source<'a>, device: &'a Device) -> Self {
+    pub(crate) fn new(source: &'a mut ValueSource<'a>, device: &'a Device) -> Self {
         Builder {
             source,
             device,
             path: Vec::new(),
+            stage: Stage::Fusion,
             next_id: 1,
         }
+    }
+
+    /// The builder, whose next tensors belong to `stage`.
+    pub(crate) fn enter(&mut self, stage: Stage) -> &mut Self {
+        self.stage = stage;
+        self
     }
 
     /// Builds a part under `name`.
@@ -173,65 +260,86 @@ impl<'a> Builder<'a> {
     pub(crate) fn parameter<const D: usize>(
         &mut self,
         name: &str,
+        role: Role,
         shape: [usize; D],
         init: Init,
     ) -> Result<Param<Tensor<D>>, WeightsError> {
-        let (id, tensor) = self.tensor(name, shape, init)?;
+        let (id, tensor) = self.tensor(name, role, shape, init)?;
         let param = Param::initialized(id, tensor);
-        // Also on a device without gradients: the setting is kept for a later `train()`.
+        // The setting is needed on a device without gradients, too: a later `train()` uses it.
         Ok(param.set_require_grad(true))
     }
 
-    /// A tensor that the forward pass updates: the statistics of a batch normalisation.
+    /// A running statistic of a batch normalisation, which the forward pass updates.
     pub(crate) fn running_state(
         &mut self,
         name: &str,
+        role: Role,
         len: usize,
         init: Init,
     ) -> Result<RunningState<Tensor<1>>, WeightsError> {
-        let (id, tensor) = self.tensor(name, [len], init)?;
+        let (id, tensor) = self.tensor(name, role, [len], init)?;
         Ok(RunningState::with_id(id, tensor))
     }
 
     fn tensor<const D: usize>(
         &mut self,
         name: &str,
+        role: Role,
         shape: [usize; D],
         init: Init,
     ) -> Result<(ParamId, Tensor<D>), WeightsError> {
         self.path.push(name.to_string());
-        let values = (self.source)(&self.path.join("."), &shape, init);
+        let spec = WeightSpec {
+            name: self.path.join("."),
+            shape: shape.to_vec(),
+            role,
+            stage: self.stage,
+        };
         self.path.pop();
-        let tensor = Tensor::from_data(TensorData::new(values?, shape), self.device);
+        let data = match (self.source)(&spec, init)? {
+            Some(values) => TensorData::new(values, shape),
+            None => TensorData::new(vec![0.0f32], [1; D]),
+        };
         let id = ParamId::from(self.next_id);
         self.next_id += 1;
-        Ok((id, tensor))
+        Ok((id, Tensor::from_data(data, self.device)))
     }
 }
 
-/// A source that draws from `rng`.
-pub(crate) fn drawn(
+/// Initial values, random ones from `rng`.
+pub(crate) fn random(
     rng: &mut impl rand::Rng,
-) -> impl FnMut(&str, &[usize], Init) -> Result<Vec<f32>, WeightsError> {
-    |_, shape, init| Ok(init.draw(shape, rng))
+) -> impl FnMut(&WeightSpec, Init) -> Result<Option<Vec<f32>>, WeightsError> {
+    |spec, init| Ok(Some(init.values(&spec.shape, rng)))
 }
 
-/// A source that takes from `weights`.
+/// Values taken from `weights`.
 pub(crate) fn taken(
     weights: &mut Weights,
-) -> impl FnMut(&str, &[usize], Init) -> Result<Vec<f32>, WeightsError> {
-    |name, shape, _| weights.take(name, shape)
+) -> impl FnMut(&WeightSpec, Init) -> Result<Option<Vec<f32>>, WeightsError> {
+    |spec, _| weights.take(&spec.name, &spec.shape).map(Some)
+}
+
+/// No values; appends the description of each tensor to `specs`.
+pub(crate) fn described(
+    specs: &mut Vec<WeightSpec>,
+) -> impl FnMut(&WeightSpec, Init) -> Result<Option<Vec<f32>>, WeightsError> {
+    |spec, _| {
+        specs.push(spec.clone());
+        Ok(None)
+    }
 }
 
 /// Every float tensor of a module with its path, in the order of the fields.
 pub(crate) fn collect(module: &impl Module) -> Vec<Weight> {
     #[derive(Default)]
-    struct Collector {
+    struct WeightCollector {
         path: Vec<String>,
         weights: Vec<Weight>,
     }
 
-    impl ModuleVisitor for Collector {
+    impl ModuleVisitor for WeightCollector {
         fn enter_module(&mut self, name: &str, _container_type: &str) {
             self.path.push(name.to_string());
         }
@@ -250,7 +358,7 @@ pub(crate) fn collect(module: &impl Module) -> Vec<Weight> {
         }
     }
 
-    let mut collector = Collector::default();
+    let mut collector = WeightCollector::default();
     module.visit(&mut collector);
     collector.weights
 }

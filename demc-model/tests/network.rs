@@ -1,4 +1,4 @@
-//! What must hold of every variant in every reading before any number is compared with PyTorch.
+//! Invariants of every variant in every reading.
 
 use burn::tensor::{Device, Distribution, Tensor, TensorData};
 use demc_model::init::OPEN_BIAS;
@@ -39,10 +39,9 @@ fn values(tensor: Tensor<4>) -> Vec<f32> {
     tensor.into_data().try_to_vec().expect("float32")
 }
 
-/// Trainable totals (network.md, counted from the paper's text and from the authors' model).
+/// Trainable totals, counted from the paper's text and from the authors' model (docs/network.md).
 #[test]
 fn parameter_totals_are_the_papers() {
-    let device = Device::flex();
     let totals = [
         (Variant::Demc, Reading::Paper, 64, 42_857_926),
         (Variant::DemcNosn, Reading::Paper, 64, 42_780_291),
@@ -52,7 +51,7 @@ fn parameter_totals_are_the_papers() {
         (Variant::Semc, Reading::Released, 79, 44_985_924),
     ];
     for (variant, reading, width, expected) in totals {
-        let found = network(config(variant, reading, width), 1, &device).parameter_count();
+        let found = config(variant, reading, width).parameter_count();
         println!("{variant:?} {reading:?} C = {width}: {found} parameters");
         assert_eq!(found, expected, "{variant:?} {reading:?}");
     }
@@ -89,7 +88,7 @@ fn same_seed_gives_the_same_network_and_another_seed_another() {
 }
 
 #[test]
-fn autodiff_device_draws_the_same_weights() {
+fn a_device_with_autodiff_has_the_same_initial_weights() {
     let config = config(Variant::Demc, Reading::Released, 2);
     let plain = network(config, 5, &Device::flex()).weights();
     assert_eq!(
@@ -99,7 +98,7 @@ fn autodiff_device_draws_the_same_weights() {
 }
 
 #[test]
-fn biases_start_at_zero_but_for_the_grey_head_and_the_open_detail_map() {
+fn biases_start_at_zero_except_for_the_grey_head_and_the_open_detail_map() {
     for (variant, reading) in every_network() {
         for weight in network(config(variant, reading, 3), 1, &Device::flex()).weights() {
             if weight.name == "decoder.head.bias" {
@@ -113,7 +112,7 @@ fn biases_start_at_zero_but_for_the_grey_head_and_the_open_detail_map() {
     }
 }
 
-/// How much of each channel of a new network's detail map is zero.
+/// The share of zeros in each channel of a new network's detail map.
 fn dead_share(detail: Detail, seed: u64) -> Vec<f64> {
     let device = Device::flex();
     let config = ModelConfig {
@@ -121,7 +120,7 @@ fn dead_share(detail: Detail, seed: u64) -> Vec<f64> {
         ..config(Variant::Demc, Reading::Paper, 8)
     };
     let map = network(config, seed, &device).detail_map(pattern([1, 12, 64, 64], 0.5, &device));
-    let map = values(map.expect("DEMC has one"));
+    let map = values(map.expect("DEMC has a detail map"));
     let share =
         |plane: &[f32]| plane.iter().filter(|v| **v == 0.0).count() as f64 / plane.len() as f64;
     map.chunks(64 * 64).map(share).collect()
@@ -129,11 +128,11 @@ fn dead_share(detail: Detail, seed: u64) -> Vec<f64> {
 
 #[test]
 fn an_open_detail_map_starts_above_zero_nearly_everywhere() {
-    let most = |detail| {
+    let mean_share = |detail| {
         let all: Vec<f64> = (1..=5).flat_map(|seed| dead_share(detail, seed)).collect();
         all.iter().sum::<f64>() / all.len() as f64
     };
-    let (open, xavier) = (most(Detail::Open), most(Detail::Xavier));
+    let (open, xavier) = (mean_share(Detail::Open), mean_share(Detail::Xavier));
     assert!(open < 0.2 && xavier > 0.3, "{open} {xavier}");
 }
 
@@ -152,7 +151,8 @@ fn skip_fusion_starts_as_sum_of_parts() {
     }
 }
 
-/// Sec. 4.2: a bilinear deconvolution keeps a constant image, away from the border that it pads with zeros.
+/// Sec. 4.2: a bilinear deconvolution keeps a constant image, except at the border, which is padded
+/// with zeros.
 #[test]
 fn deconvolution_starts_as_bilinear_upsampling() {
     let device = Device::flex();
@@ -173,7 +173,7 @@ fn deconvolution_starts_as_bilinear_upsampling() {
 }
 
 #[test]
-fn weights_survive_the_way_out_and_in() {
+fn loaded_weights_are_the_saved_ones() {
     let device = Device::flex();
     for (variant, reading) in every_network() {
         let config = config(variant, reading, 2);
@@ -186,7 +186,7 @@ fn weights_survive_the_way_out_and_in() {
 }
 
 #[test]
-fn loading_is_strict() {
+fn missing_unknown_and_misshapen_weights_are_refused() {
     let device = Device::flex();
     let config = config(Variant::Demc, Reading::Paper, 2);
     let weights = network(config, 1, &device).weights();
@@ -221,10 +221,10 @@ fn loading_is_strict() {
     assert!(matches!(shape, WeightsError::Shape { .. }), "{shape}");
 }
 
-/// The trap of Burn 0.22.1 that `Denoiser::weights` works around: an update of running statistics is merged only at
-/// the next one.
+/// A trap of Burn that `Denoiser::weights` avoids: an update of running statistics is merged only
+/// at the next one.
 #[test]
-fn weights_hold_the_last_batch_in_their_running_statistics() {
+fn running_statistics_include_the_last_batch() {
     let device = Device::flex().autodiff();
     let model = network(config(Variant::Demc, Reading::Paper, 2), 1, &device);
     let mean = |model: &Denoiser| {
@@ -252,7 +252,8 @@ fn every_trainable_weight_gets_a_gradient() {
         let features = Tensor::random([2, 12, 64, 64], Distribution::Normal(0.0, 1.0), &device);
         let grads = model.forward(color, features).sum().backward();
         let grads = burn::optim::GradientsParams::from_grads(grads, &model);
-        let trainable = model.weights().iter().filter(|w| w.is_trainable()).count();
+        let specs = model.config().weight_specs().into_iter();
+        let trainable = specs.filter(|spec| spec.is_trainable()).count();
         assert_eq!(grads.len(), trainable, "{variant:?} {reading:?}");
     }
 }

@@ -1,4 +1,4 @@
-//! What the program says and writes, as a stranger meets it.
+//! The output and the files of the program.
 
 mod common;
 
@@ -10,25 +10,27 @@ use std::time::{Duration, Instant};
 use common::{command, config, error_line, stderr, train};
 
 #[test]
-fn a_short_run_leaves_everything_behind() {
+fn a_short_run_writes_all_files() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let run = dir.path().join("run");
     let output = train(&config(dir.path()), &run, &["--set", "train.steps=4"]);
     assert!(output.status.success(), "{}", stderr(&output));
-    assert_eq!(stderr(&output), "", "quiet where stderr is no terminal");
+    assert_eq!(stderr(&output), "", "no progress bar without a terminal");
 
     let text = String::from_utf8_lossy(&output.stdout);
     let first = text.lines().next().expect("a line");
     assert!(
         first.starts_with("demc-train: about ")
-            && first.contains("a step")
+            && first.contains("per step")
             && first.contains("(kernels on "),
         "{first}"
     );
-    assert!(
-        text.contains("| mean "),
-        "the table of the test split: {text}"
-    );
+    for words in [
+        "kept weights: those of step 4 of 4, with the best validation RelMSE ",
+        "| mean ",
+    ] {
+        assert!(text.contains(words), "{words}: {text}");
+    }
 
     for file in [
         "config.toml",
@@ -83,11 +85,14 @@ fn every_variant_and_reading_trains() {
                 "data.validation=0",
             ];
             let output = train(&config, &run, &sets);
+            let text = String::from_utf8_lossy(&output.stdout);
+            let kept = "kept weights: those of the last step 1, no scene is held out";
             assert!(
                 output.status.success(),
                 "{variant} {reading}: {}",
                 stderr(&output)
             );
+            assert!(text.contains(kept), "{text}");
         }
     }
 }
@@ -102,7 +107,7 @@ fn check_writes_nothing() {
 }
 
 #[test]
-fn bad_configurations_exit_with_2_and_one_line() {
+fn invalid_configurations_exit_with_2_and_one_line() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let run = dir.path().join("run");
@@ -119,8 +124,11 @@ fn bad_configurations_exit_with_2_and_one_line() {
     );
     assert!(
         all.contains("train.steps") && all.contains("data.stride"),
-        "all at once: {all}"
+        "both problems: {all}"
     );
+
+    let old = error("train.muon=64");
+    assert!(old.contains("optimizer.muon_max_rows"), "{old}");
 
     let misspelt = dir.path().join("misspelt.toml");
     fs::write(&misspelt, "[model]\n\nwidht = 3\n").expect("a file");
@@ -135,7 +143,7 @@ fn bad_configurations_exit_with_2_and_one_line() {
 }
 
 #[test]
-fn bad_worlds_exit_with_1_and_one_line() {
+fn invalid_data_and_directories_exit_with_1_and_one_line() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let run = dir.path().join("run");
@@ -155,11 +163,11 @@ fn bad_worlds_exit_with_1_and_one_line() {
     let output = train(&config, &file.join("run"), &["--set", "train.steps=1"]);
     assert!(
         error_line(&output, 1).contains("file"),
-        "a run directory that cannot be made"
+        "a run directory that cannot be created"
     );
 }
 
-/// Reading and decoding need none of the threads that train, which wait for them.
+/// Decoding needs none of the training threads, which wait for it.
 #[test]
 fn one_thread_is_enough() {
     let dir = tempfile::tempdir().expect("a temporary directory");

@@ -1,7 +1,7 @@
-//! A disk that fills at any moment: the error says so, and the run goes on once there is room.
+//! A disk that fills at any moment: the error names it, and the run resumes once there is space.
 //!
-//! On a tmpfs of its own in a mount namespace of its own, which takes `unshare` and the right to use it. Where that is not to
-//! be had the test says so and passes, unless `DEMC_REQUIRE_TMPFS=1`.
+//! Uses a tmpfs in a new mount namespace, which needs `unshare` and permission. Without them the
+//! test is skipped, or fails with `DEMC_REQUIRE_TMPFS=1`.
 #![cfg(target_os = "linux")]
 
 mod common;
@@ -12,7 +12,8 @@ use std::process::Command;
 
 use common::{assert_same_run, config, stderr, train};
 
-/// Trains on a disk of `$SIZE` KiB until that is full, then on a larger one to the end, and copies the run to `$OUT`.
+/// Trains on a disk of `$SIZE` KiB until it is full, resumes on a larger one, and copies the run to
+/// `$OUT`.
 const SCRIPT: &str = r#"
 set -u
 mount -t tmpfs -o size="${SIZE}k" tmpfs "$DISK" || exit 99
@@ -23,7 +24,7 @@ mount -o remount,size=1g "$DISK" || exit 99
 cp -r "$DISK/run" "$OUT"
 "#;
 
-/// A shell with mounts of its own.
+/// A shell in a new mount namespace.
 fn shell(script: &str) -> Command {
     let root =
         fs::metadata("/proc/self").is_ok_and(|own| std::os::unix::fs::MetadataExt::uid(&own) == 0);
@@ -41,7 +42,7 @@ fn may_mount(dir: &Path) -> bool {
 }
 
 #[test]
-fn a_run_on_a_disk_that_filled_up_goes_on_when_there_is_room() {
+fn a_run_on_a_full_disk_resumes_once_there_is_space() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let disk = dir.path().join("disk");
     fs::create_dir(&disk).expect("a directory");
@@ -101,7 +102,7 @@ fn a_run_on_a_disk_that_filled_up_goes_on_when_there_is_room() {
         println!("{size} KiB: {error}");
     }
     let in_checkpoint =
-        |(_, error, _): &&(i32, String, usize)| error.contains("the last good one is");
+        |(_, error, _): &&(i32, String, usize)| error.contains("the last intact checkpoint is");
     assert!(stops.len() >= 6, "{stops:?}");
     assert!(stops.iter().any(|stop| in_checkpoint(&stop)), "{stops:?}");
 }

@@ -1,4 +1,4 @@
-//! Runs that begin with the weights of another: `train.init`.
+//! Runs that start from the weights of another: `train.init`.
 
 mod common;
 
@@ -9,10 +9,9 @@ use burn::tensor::Device;
 use common::{config, error_line, stderr, train};
 use demc_infer::Bundle;
 use demc_infer::bundle::{Names, Precision};
-use demc_train::checkpoint::sha256_of;
+use demc_train::run::checkpoint::store::sha256_of;
 
-/// The weights that a run is known by, in the order of their names, but for running statistics: those move whatever the
-/// learning rate.
+/// The best weights of a run without running statistics, which change at any learning rate.
 fn weights(run: &Path) -> Vec<(String, Vec<f32>)> {
     let bundle = Bundle::load(run, &Device::flex()).expect("a network");
     let weights = bundle.model.weights().into_iter();
@@ -20,7 +19,7 @@ fn weights(run: &Path) -> Vec<(String, Vec<f32>)> {
     learned.map(|weight| (weight.name, weight.data)).collect()
 }
 
-/// Checks that both have the same weights, but for steps of a rate of 1e-30.
+/// Checks that both have the same weights, up to steps with a learning rate of 1e-30.
 fn assert_same(ours: &Path, theirs: &Path) {
     for ((name, ours), (same, theirs)) in weights(ours).iter().zip(&weights(theirs)) {
         assert_eq!(name, same);
@@ -29,21 +28,21 @@ fn assert_same(ours: &Path, theirs: &Path) {
     }
 }
 
-/// A run of two steps, and what one that begins with its weights is told.
-struct Begun {
+/// A run of two steps, and arguments for one that starts from its weights.
+struct SecondRun {
     config: PathBuf,
     /// `train.init=RUN`
     init: String,
-    /// The directory of the other run, not there yet.
+    /// The directory of the second run, which does not exist yet.
     second: PathBuf,
 }
 
-fn begun(dir: &Path) -> Begun {
+fn second_run(dir: &Path) -> SecondRun {
     let config = config(dir);
     let first = dir.join("first");
     let output = train(&config, &first, &["--set", "train.steps=2"]);
     assert!(output.status.success(), "{}", stderr(&output));
-    Begun {
+    SecondRun {
         config,
         init: format!("train.init={}", first.display()),
         second: dir.join("second"),
@@ -51,23 +50,28 @@ fn begun(dir: &Path) -> Begun {
 }
 
 #[test]
-fn a_run_begins_where_another_ended() {
+fn a_run_starts_from_the_weights_of_another() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
-    let at = |name: &str| dir.path().join(name);
-    let (first, second, third) = (at("first"), at("second"), at("third"));
-    let plain = ["--set", "train.ema=0"];
+    let path = |name: &str| dir.path().join(name);
+    let (first, second, third) = (path("first"), path("second"), path("third"));
+    let plain = ["--set", "train.ema_decay="];
     let few = [&plain[..], &["--set", "train.steps=3"]].concat();
     let output = train(&config, &first, &few);
     assert!(output.status.success(), "{}", stderr(&output));
 
-    // One step of a rate that rounds to none.
+    // One step with a rate that rounds to zero.
     let init = format!("train.init={}", first.display());
-    let one = ["--set", "train.steps=1", "--set", "train.lr_start=1e-30"];
+    let one = [
+        "--set",
+        "train.steps=1",
+        "--set",
+        "optimizer.lr_start=1e-30",
+    ];
     let still = [
         &plain[..],
         &one,
-        &["--set", "train.lr_end=1e-30", "--set", &init],
+        &["--set", "optimizer.lr_end=1e-30", "--set", &init],
     ]
     .concat();
     let output = train(&config, &second, &still);
@@ -80,7 +84,7 @@ fn a_run_begins_where_another_ended() {
     assert!(began.starts_with(&first) && record["init"]["step"] == 3);
     assert_eq!(record["init"]["sha256"], sum.as_str());
 
-    // The other seed would draw another network; and what began needs the weights no more.
+    // Another seed would initialise another network. A resume does not need the initial weights.
     let seeded = [&still[..], &["--set", "train.seed=2"]].concat();
     let output = train(&config, &third, &seeded);
     assert!(output.status.success(), "{}", stderr(&output));
@@ -90,13 +94,13 @@ fn a_run_begins_where_another_ended() {
     assert!(output.status.success(), "{}", stderr(&output));
 }
 
-/// What the weights had seen before belongs to what the network knows, after a resume too.
+/// The ranges of the scenes of the first run are kept, after a resume too.
 #[test]
-fn ranges_of_the_scenes_before_are_kept() {
+fn ranges_of_the_first_run_are_kept() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
-    let at = |name: &str| dir.path().join(name);
-    let (first, wide, second) = (at("first"), at("wide.safetensors"), at("second"));
+    let path = |name: &str| dir.path().join(name);
+    let (first, wide, second) = (path("first"), path("wide.safetensors"), path("second"));
     let output = train(&config, &first, &["--set", "train.steps=2"]);
     assert!(output.status.success(), "{}", stderr(&output));
     let mut bundle = Bundle::load(&first, &Device::flex()).expect("a network");
@@ -106,9 +110,9 @@ fn ranges_of_the_scenes_before_are_kept() {
     saved.expect("a file");
 
     let init = format!("train.init={}", wide.display());
-    let again = ["--set", "train.steps=2", "--set", &init];
+    let sets = ["--set", "train.steps=2", "--set", &init];
     let ranges_after = |more: &[&str]| {
-        let output = train(&config, &second, &[&again[..], more].concat());
+        let output = train(&config, &second, &[&sets[..], more].concat());
         assert!(output.status.success(), "{}", stderr(&output));
         let bundle = Bundle::load(&second, &Device::flex()).expect("a network");
         bundle.meta.ranges.expect("ranges")
@@ -124,15 +128,15 @@ fn ranges_of_the_scenes_before_are_kept() {
 }
 
 #[test]
-fn weights_that_saw_another_colour_are_told() {
+fn a_change_of_the_input_colour_is_noted() {
     let dir = tempfile::tempdir().expect("a temporary directory");
-    let Begun {
+    let SecondRun {
         config,
         init,
         second,
-    } = begun(dir.path());
-    let note = |demodulate: &str| {
-        let set = format!("data.demodulate={demodulate}");
+    } = second_run(dir.path());
+    let note = |epsilon: &str| {
+        let set = format!("data.albedo_demodulation_epsilon={epsilon}");
         let output = train(
             &config,
             &second,
@@ -145,22 +149,23 @@ fn weights_that_saw_another_colour_are_told() {
             .find(|line| line.starts_with("note: train.init"));
         note.expect("a note").to_string()
     };
-    assert!(note("0").ends_with("step 2"));
-    assert!(note("0.07").contains("step 2, of data.demodulate = 0: with 0.07 "));
+    assert!(note("").ends_with("step 2"));
+    let changed = "step 2; data.albedo_demodulation_epsilon: 0.07 instead of absent";
+    assert!(note("0.07").contains(changed));
 }
 
 #[test]
-fn weights_that_do_not_fit_are_refused_before_anything_is_written() {
+fn weights_of_another_network_are_refused_before_anything_is_written() {
     let dir = tempfile::tempdir().expect("a temporary directory");
-    let Begun {
+    let SecondRun {
         config,
         init,
         second,
-    } = begun(dir.path());
+    } = second_run(dir.path());
     let wider = ["--set", &init, "--set", "model.width=3"];
     let line = error_line(&train(&config, &second, &wider), 1);
     assert!(line.contains("train.init"), "{line}");
-    assert!(line.contains("model.width = 3, there 2"), "{line}");
+    assert!(line.contains("model.width: 3 instead of 2"), "{line}");
 
     let nothing = ["--set", "train.init=nowhere.safetensors"];
     let line = error_line(&train(&config, &second, &nothing), 1);

@@ -1,4 +1,4 @@
-//! A run that was killed and resumed is the run that was not, byte for byte.
+//! A run that was killed and resumed equals an uninterrupted one, byte for byte.
 
 mod common;
 
@@ -9,7 +9,8 @@ use std::time::{Duration, Instant};
 
 use common::{assert_same_run, command, config, error_line, metrics, stderr, train};
 
-/// Starts the run, kills it (SIGKILL) once its log has `lines` lines, and says whether it was still running.
+/// Starts the run and kills it (SIGKILL) once its log has `lines` lines. Returns whether it was
+/// still running.
 fn kill_after(config: &Path, run: &Path, args: &[&str], lines: usize) -> bool {
     let mut child = command(config, run, args)
         .stdout(Stdio::null())
@@ -30,7 +31,7 @@ fn kill_after(config: &Path, run: &Path, args: &[&str], lines: usize) -> bool {
 }
 
 #[test]
-fn killed_and_resumed_equals_undisturbed() {
+fn a_killed_and_resumed_run_equals_an_uninterrupted_one() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let (whole, broken) = (dir.path().join("whole"), dir.path().join("broken"));
@@ -39,7 +40,7 @@ fn killed_and_resumed_equals_undisturbed() {
     assert!(output.status.success(), "{}", stderr(&output));
     assert_eq!(metrics(&whole).len(), 6);
 
-    // Before the first checkpoint, between two, and after a validation.
+    // Before the first checkpoint, between two checkpoints, and after a validation.
     assert!(kill_after(&config, &broken, &[], 1));
     assert!(kill_after(&config, &broken, &["--resume"], 2));
     assert!(kill_after(&config, &broken, &["--resume"], 4));
@@ -53,9 +54,9 @@ fn killed_and_resumed_equals_undisturbed() {
     assert_eq!(kept, 2, "run.keep = 2");
 }
 
-/// The run directory alone repeats the run: its configuration names everything.
+/// The saved configuration alone repeats the run.
 #[test]
-fn resolved_configuration_repeats_the_run() {
+fn the_saved_configuration_repeats_the_run() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let (first, second) = (dir.path().join("first"), dir.path().join("second"));
@@ -70,7 +71,7 @@ fn resolved_configuration_repeats_the_run() {
 }
 
 #[test]
-fn run_directories_are_not_mixed_up() {
+fn a_directory_with_another_run_is_refused() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let run = dir.path().join("run");
@@ -82,13 +83,13 @@ fn run_directories_are_not_mixed_up() {
     let before = fs::read(run.join("metrics.jsonl")).expect("a log");
 
     let error = error_line(&train(&config, &run, &["--set", "train.steps=3"]), 1);
-    assert!(error.contains("--resume continues it"), "{error}");
+    assert!(error.contains("--resume resumes it"), "{error}");
     let error = error_line(
         &train(&config, &run, &["--resume", "--set", "train.seed=2"]),
         1,
     );
     assert!(
-        error.contains("train.seed = 2, there 1") && error.contains("train.steps"),
+        error.contains("train.seed: 2 instead of 1") && error.contains("train.steps"),
         "{error}"
     );
     assert_eq!(
@@ -98,9 +99,10 @@ fn run_directories_are_not_mixed_up() {
     );
 }
 
-/// Whatever is lost or damaged, the run goes on: at worst from the checkpoint before, and says so.
+/// Whatever is missing or damaged, the run resumes, at worst from the previous checkpoint, with a
+/// note.
 #[test]
-fn lost_and_damaged_files_cost_one_checkpoint_at_most() {
+fn missing_and_damaged_files_cost_at_most_one_checkpoint() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let (whole, run) = (dir.path().join("whole"), dir.path().join("run"));
@@ -129,13 +131,17 @@ fn lost_and_damaged_files_cost_one_checkpoint_at_most() {
         (&state, &half, "state.json: damaged"),
         (&state, &remove, "state.json: No such file"),
         (&sums, &remove, "SHA256SUMS: No such file"),
-        (last, &remove, "names `step-00000012`, which is not there"),
+        (
+            last,
+            &remove,
+            "names the missing checkpoint `step-00000012`",
+        ),
         ("latest", &remove, "latest: No such file"),
-        ("config.toml", &remove, "config.toml was gone"),
-        ("run.json", &remove, "run.json was gone"),
-        ("best.safetensors", &remove, "best.safetensors was gone"),
+        ("config.toml", &remove, "config.toml was missing"),
+        ("run.json", &remove, "run.json was missing"),
+        ("best.safetensors", &remove, "best.safetensors was missing"),
         ("best.safetensors", &half, ""),
-        ("metrics.jsonl", &remove, "metrics.jsonl was gone"),
+        ("metrics.jsonl", &remove, "metrics.jsonl was missing"),
     ];
     for (file, harm, words) in harms {
         harm(&run.join(file));
@@ -148,13 +154,13 @@ fn lost_and_damaged_files_cost_one_checkpoint_at_most() {
             assert!(same, "{file} differs after {words}");
         }
     }
-    assert!(metrics(&run).is_empty(), "the log is not made up");
+    assert!(metrics(&run).is_empty(), "the log is not invented");
 
     half(&run.join(&model));
     half(&run.join(before).join("state.json"));
     let error = error_line(&train(&config, &run, &["--resume"]), 1);
     assert!(
-        error.contains("no checkpoint is whole")
+        error.contains("no intact checkpoint")
             && error.contains("step-00000012/model.safetensors")
             && error.contains("step-00000009/state.json"),
         "{error}"
@@ -186,7 +192,7 @@ fn checkpoints_of_another_format_are_refused() {
     );
 }
 
-/// What is written is what `sha256sum -c` accepts.
+/// `sha256sum -c` accepts the checksums.
 #[test]
 fn checksums_are_those_of_sha256sum() {
     let dir = tempfile::tempdir().expect("a temporary directory");
@@ -206,7 +212,7 @@ fn checksums_are_those_of_sha256sum() {
 }
 
 #[test]
-fn what_a_run_lost_or_changed_is_named() {
+fn a_changed_layout_and_a_locked_directory_are_refused() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let run = dir.path().join("run");
@@ -223,7 +229,7 @@ fn what_a_run_lost_or_changed_is_named() {
     assert!(output.status.success(), "{}", stderr(&output));
     assert!(
         run.join("layout.toml").is_file(),
-        "the run holds its own layout"
+        "the run has a copy of the layout"
     );
 
     let text = fs::read_to_string(&layout).expect("a layout");
@@ -232,7 +238,7 @@ fn what_a_run_lost_or_changed_is_named() {
     fs::write(&layout, swapped).expect("a layout");
     let error = error_line(&train(&config, &run, &resume), 1);
     assert!(
-        error.contains("another network, layout or statistics"),
+        error.contains("network, layout or statistics of the checkpoint differ"),
         "{error}"
     );
     let kept = fs::read_to_string(run.join("layout.toml")).expect("the run's layout");
@@ -245,6 +251,6 @@ fn what_a_run_lost_or_changed_is_named() {
     let lock = fs::File::create(run.join("lock")).expect("a lock");
     lock.try_lock().expect("nobody trains");
     let error = error_line(&train(&config, &run, &resume), 1);
-    assert!(error.contains("another process"), "{error}");
+    assert!(error.contains("another training process"), "{error}");
     drop(lock);
 }

@@ -1,25 +1,28 @@
-//! Ctrl-C, SIGTERM, SIGHUP and SIGKILL at any moment: nothing is lost.
+//! Ctrl-C, SIGTERM, SIGHUP and SIGKILL at any moment lose nothing.
 #![cfg(unix)]
 
 mod common;
 
 use std::path::{Path, PathBuf};
-use std::process::{Child, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::Instant;
 
 use common::{assert_same_run, command, config, metrics, stderr, train, wait_until};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rustix::process::{Pid, Signal, kill_process};
+use signal_hook::consts::{SIGCONT, SIGHUP, SIGINT, SIGKILL, SIGSTOP, SIGTERM};
 
-/// How often runs are killed.
+/// Number of kills.
 const KILLS: usize = 40;
-/// A checkpoint each step: most of the time goes into writing them.
+/// A checkpoint after each step, so that most of the time is spent on writing.
 const EVERY_STEP: [&str; 2] = ["--set", "run.checkpoint_every=1"];
 
-fn send(child: &Child, signal: Signal) {
-    let pid = Pid::from_child(child);
-    kill_process(pid, signal).expect("a child that was not waited for");
+/// Sends a signal with the `kill` program of every Unix.
+fn send(child: &Child, signal: i32) {
+    let status = Command::new("kill")
+        .args([format!("-{signal}"), child.id().to_string()])
+        .status();
+    assert!(status.expect("kill runs").success(), "signal {signal}");
 }
 
 fn start(config: &Path, run: &Path, args: &[&str]) -> Child {
@@ -50,9 +53,9 @@ fn signal_of(status: ExitStatus) -> Option<i32> {
     std::os::unix::process::ExitStatusExt::signal(&status)
 }
 
-/// Runs are killed at random moments, by random signals, until they end nevertheless.
+/// Runs are killed at random moments by random signals until they complete.
 #[test]
-fn runs_killed_dozens_of_times_end_like_one_that_never_was() {
+fn runs_killed_dozens_of_times_equal_an_uninterrupted_one() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let whole = dir.path().join("whole");
@@ -62,13 +65,7 @@ fn runs_killed_dozens_of_times_end_like_one_that_never_was() {
     let duration = started.elapsed();
 
     let mut rng = ChaCha8Rng::seed_from_u64(4);
-    let signals = [
-        Signal::KILL,
-        Signal::KILL,
-        Signal::TERM,
-        Signal::INT,
-        Signal::HUP,
-    ];
+    let signals = [SIGKILL, SIGKILL, SIGTERM, SIGINT, SIGHUP];
     let args = [&EVERY_STEP[..], &["--resume"]].concat();
     let (mut kills, mut saved, mut runs) = (0, 0, 0);
     while kills < KILLS {
@@ -85,16 +82,11 @@ fn runs_killed_dozens_of_times_end_like_one_that_never_was() {
             }
             let output = child.wait_with_output().expect("a child");
             let code = output.status.code();
-            // Killed at once, stopped with everything saved, or done before the signal came.
-            let known = [Some(0), Some(128 + signal.as_raw())].contains(&code)
-                || (alive && signal_of(output.status) == Some(signal.as_raw()));
-            assert!(
-                known,
-                "{signal:?}: {:?}: {}",
-                output.status,
-                stderr(&output)
-            );
-            saved += usize::from(alive && code == Some(128 + signal.as_raw()));
+            // Killed at once, stopped with everything saved, or complete before the signal.
+            let known = [Some(0), Some(128 + signal)].contains(&code)
+                || (alive && signal_of(output.status) == Some(signal));
+            assert!(known, "{signal}: {:?}: {}", output.status, stderr(&output));
+            saved += usize::from(alive && code == Some(128 + signal));
             if code == Some(0) {
                 break;
             }
@@ -109,16 +101,12 @@ fn runs_killed_dozens_of_times_end_like_one_that_never_was() {
 }
 
 #[test]
-fn the_first_signal_saves_and_stops() {
+fn the_first_signal_saves_a_checkpoint_and_stops() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
-    for (signal, name) in [
-        (Signal::INT, "SIGINT"),
-        (Signal::TERM, "SIGTERM"),
-        (Signal::HUP, "SIGHUP"),
-    ] {
+    for (signal, name) in [(SIGINT, "SIGINT"), (SIGTERM, "SIGTERM"), (SIGHUP, "SIGHUP")] {
         let run = dir.path().join(name);
-        // No checkpoint but the signal's.
+        // The only checkpoint is that of the signal.
         let long = [
             "--set",
             "train.steps=100000",
@@ -129,7 +117,7 @@ fn the_first_signal_saves_and_stops() {
         wait_for_a_line(&mut child, &run);
         send(&child, signal);
         let output = child.wait_with_output().expect("a child");
-        assert_eq!(output.status.code(), Some(128 + signal.as_raw()));
+        assert_eq!(output.status.code(), Some(128 + signal));
         let text = String::from_utf8_lossy(&output.stdout);
         let step = newest(&run).expect("a checkpoint");
         let words = format!("{name}: stopped after step {step}, everything is saved");
@@ -138,7 +126,8 @@ fn the_first_signal_saves_and_stops() {
     }
 }
 
-/// Steps take seconds here: the second signal waits neither for the one under way nor for a checkpoint.
+/// Steps take seconds here. The second signal waits neither for the current step nor for a
+/// checkpoint.
 #[test]
 fn the_second_signal_stops_at_once() {
     let dir = tempfile::tempdir().expect("a temporary directory");
@@ -156,19 +145,19 @@ fn the_second_signal_stops_at_once() {
     ];
     let mut child = start(&config, &run, &long);
     wait_for_a_line(&mut child, &run);
-    for signal in [Signal::STOP, Signal::INT, Signal::TERM, Signal::CONT] {
+    for signal in [SIGSTOP, SIGINT, SIGTERM, SIGCONT] {
         send(&child, signal);
     }
     let output = child.wait_with_output().expect("a child");
-    // The system decides which of the two comes second.
-    let codes = [Signal::INT, Signal::TERM].map(|signal| Some(128 + signal.as_raw()));
+    // The system decides which of the two is delivered second.
+    let codes = [SIGINT, SIGTERM].map(|signal| Some(128 + signal));
     assert!(codes.contains(&output.status.code()), "{:?}", output.status);
     assert_eq!(newest(&run), None);
 }
 
-/// A checkpoint is due by the clock, whatever the steps.
+/// Checkpoints are due by the clock too.
 #[test]
-fn minutes_make_checkpoints_too() {
+fn checkpoint_minutes_write_checkpoints() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let run = dir.path().join("run");
     // A hundredth of a second.

@@ -1,7 +1,7 @@
-//! Event files of an interrupted and resumed run, read back by the real `tensorboard` package.
+//! Event files of an interrupted and resumed run, read by the `tensorboard` package.
 //!
-//! Needs a Python with it (`pip install tensorboard`; TensorFlow is not needed), named by `DEMC_PYTHON`. Without one the
-//! test says that it was skipped; with `DEMC_REQUIRE_TENSORBOARD=1` it fails.
+//! Needs a Python interpreter with `tensorboard` (without TensorFlow), named by `DEMC_PYTHON`.
+//! Without one the test is skipped, or fails with `DEMC_REQUIRE_TENSORBOARD=1`.
 
 use std::fmt::Write as _;
 use std::fs::{self, OpenOptions};
@@ -9,16 +9,16 @@ use std::io::Write;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use demc_train::tensorboard::Events;
+use demc_train::record::tensorboard::EventFile;
 use serde_json::{Value, json};
 
-/// Reads a directory of event files and prints what is in it.
+/// Reads a directory of event files and prints its contents.
 const READER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/tensorboard_read.py");
-/// Markdown with what could go wrong in it.
+/// Markdown with characters that need care.
 const CONFIG: &str = "## Größe\n\n```toml\nwidth = 64\n```\n";
 
 #[test]
-fn tensorboard_reads_a_resumed_run_as_one_that_was_never_stopped() {
+fn tensorboard_reads_a_resumed_run_like_an_uninterrupted_one() {
     let python = match python_with_tensorboard() {
         Ok(python) => python,
         Err(reason) => {
@@ -44,7 +44,7 @@ fn tensorboard_reads_a_resumed_run_as_one_that_was_never_stopped() {
         "scalars": {
             "loss": [[1, 0.5], [2, 1.0], [3, 1.5], [4, 2.0], [5, 105.0], [6, 106.0], [7, "nan"], [8, "inf"]],
             "lr": [[1, 0.25], [2, 0.25], [3, 0.25], [4, 0.25], [5, 0.125], [6, 0.125], [7, 0.125], [8, 0.125]],
-            // Step 6 took it as well, and was not taken that way again.
+            // The value of step 6 is dropped: the resumed run has none.
             "valid/relmse": [[4, 0.0]],
         },
         "images": { "strip": [[4, 5, 3, hex(&early)], [8, 4, 7, hex(&late)]] },
@@ -54,9 +54,9 @@ fn tensorboard_reads_a_resumed_run_as_one_that_was_never_stopped() {
     assert_eq!(read["plugin"], expected);
 }
 
-/// Six steps; a checkpoint is written after the fourth.
+/// Writes six steps; the checkpoint is after the fourth.
 fn write_until_the_crash(run: &Path, strip: &[u8]) -> anyhow::Result<()> {
-    let mut events = Events::open(run, 0)?;
+    let mut events = EventFile::open(run, 0)?;
     events.text(0, "config", CONFIG)?;
     for step in 1..=6 {
         events.scalars(step, &[("loss", 0.5 * step as f64), ("lr", 0.25)])?;
@@ -68,7 +68,7 @@ fn write_until_the_crash(run: &Path, strip: &[u8]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What a crash in the middle of a write leaves behind.
+/// Appends an incomplete record, as after a crash.
 fn tear_the_last_record(run: &Path) {
     let mut files = fs::read_dir(run).expect("a directory");
     let file = files.next().expect("a file").expect("its entry").path();
@@ -79,9 +79,9 @@ fn tear_the_last_record(run: &Path) {
     written.expect("an event file that can be written");
 }
 
-/// Steps five to eight, with other values than those of the first session.
+/// Writes steps five to eight, with values that differ from the first session.
 fn write_from_the_checkpoint(run: &Path, strip: &[u8]) -> anyhow::Result<()> {
-    let mut events = Events::open(run, 4)?;
+    let mut events = EventFile::open(run, 4)?;
     for (step, loss) in [(5, 105.0), (6, 106.0), (7, f64::NAN), (8, f64::INFINITY)] {
         events.scalars(step, &[("loss", loss), ("lr", 0.125)])?;
     }
@@ -93,7 +93,7 @@ fn png(width: u32, height: u32) -> Vec<u8> {
     let mut file = Vec::new();
     let mut encoder = png::Encoder::new(&mut file, width, height);
     encoder.set_color(png::ColorType::Rgb);
-    let pixels: Vec<u8> = (0..3 * width * height).map(|at| at as u8).collect();
+    let pixels: Vec<u8> = (0..3 * width * height).map(|i| i as u8).collect();
     let mut writer = encoder.write_header().expect("a header");
     writer.write_image_data(&pixels).expect("as many pixels");
     writer.finish().expect("memory is never full");
@@ -115,7 +115,7 @@ fn read(python: &str, run: &Path) -> Value {
     serde_json::from_slice(&output.stdout).expect("JSON")
 }
 
-/// A Python interpreter that imports `tensorboard`; else why there is none.
+/// A Python interpreter that imports `tensorboard`, or why there is none.
 fn python_with_tensorboard() -> Result<String, String> {
     let python = std::env::var("DEMC_PYTHON").map_err(|_| "DEMC_PYTHON is not set".to_string())?;
     let output = run_python(&python, ["-c".as_ref(), "import tensorboard".as_ref()])

@@ -1,4 +1,4 @@
-"""Prints as JSON what the `tensorboard` package finds in a directory of event files, through both of its accumulators."""
+"""Prints the contents of a directory of event files as JSON, read by both accumulators of `tensorboard`."""
 
 import json
 import math
@@ -9,7 +9,7 @@ from tensorboard.util import tensor_util
 
 
 def number(value):
-    """JSON knows no NaN and no infinity."""
+    """A value for JSON, which has no NaN and no infinity."""
     value = float(value)
     return value if math.isfinite(value) else str(value)
 
@@ -23,8 +23,8 @@ def classic(path):
     keep_all = {kind: 0 for kind in event_accumulator.DEFAULT_SIZE_GUIDANCE}
     events = event_accumulator.EventAccumulator(path, size_guidance=keep_all).Reload()
     tags = events.Tags()
-    of_text = events.PluginTagToContent("text")
-    assert sorted(tags["tensors"]) == sorted(of_text), tags
+    text_tags = events.PluginTagToContent("text")
+    assert sorted(tags["tensors"]) == sorted(text_tags), tags
     return {
         "scalars": {
             tag: [[e.step, number(e.value)] for e in events.Scalars(tag)] for tag in tags["scalars"] if events.Scalars(tag)
@@ -33,12 +33,12 @@ def classic(path):
             tag: [[e.step, e.width, e.height, e.encoded_image_string.hex()] for e in events.Images(tag)]
             for tag in tags["images"]
         },
-        "text": {tag: [[e.step, text(e.tensor_proto)] for e in events.Tensors(tag)] for tag in of_text},
+        "text": {tag: [[e.step, text(e.tensor_proto)] for e in events.Tensors(tag)] for tag in text_tags},
     }
 
 
 def plugin(path):
-    """What TensorBoard itself reads with where its data server is not installed: everything is a tensor of a plugin."""
+    """The reader of TensorBoard without its data server: every value is a tensor of a plugin."""
     keep_all = {name: 0 for name in ["scalars", "images", "text"]}
     events = plugin_event_accumulator.EventAccumulator(path, tensor_size_guidance=keep_all).Reload()
     found = {"scalars": {}, "images": {}, "text": {}}

@@ -1,4 +1,4 @@
-//! What goes wrong in a run is said, with everything that helps to find out why.
+//! Errors during a run name everything that helps to find their cause.
 
 mod common;
 
@@ -7,21 +7,26 @@ use std::process::Stdio;
 
 use common::{command, config, error_line, metrics, stderr, train, wait_until};
 
-/// A learning rate at which one step is the end.
-const EXPLODE: [&str; 4] = ["--set", "train.lr_start=1e30", "--set", "data.validation=0"];
+/// A learning rate at which the first step diverges.
+const EXPLODE: [&str; 4] = [
+    "--set",
+    "optimizer.lr_start=1e30",
+    "--set",
+    "data.validation=0",
+];
 
 #[test]
-fn a_loss_that_is_not_finite_stops_the_run_and_names_its_patches() {
+fn a_non_finite_loss_stops_the_run_and_names_its_patches() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let run = dir.path().join("run");
     let args = [&EXPLODE[..], &["--set", "run.checkpoint_every=1"]].concat();
     let error = error_line(&train(&config(dir.path()), &run, &args), 1);
     for words in [
-        "step 2: loss ",
-        "at learning rate 1.1",
-        "not finite; patches: ",
+        "step 2: non-finite loss or gradient: loss ",
+        "learning rate 1.1",
+        "; patches: ",
         " (x ",
-        "the last good checkpoint is ",
+        "the last intact checkpoint is ",
         "checkpoints/step-00000001",
         "train.on_nan=skip",
     ] {
@@ -34,7 +39,7 @@ fn a_loss_that_is_not_finite_stops_the_run_and_names_its_patches() {
 }
 
 #[test]
-fn skipped_steps_are_counted_and_too_many_are_the_end() {
+fn skipped_steps_are_counted_and_too_many_end_the_run() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let run = dir.path().join("run");
@@ -42,12 +47,12 @@ fn skipped_steps_are_counted_and_too_many_are_the_end() {
     let output = train(&config, &run, &[&EXPLODE[..], &skip].concat());
     let error = error_line(&output, 1);
     assert!(
-        error.contains("step 101: ") && error.contains("not finite, for 100 steps in a row"),
+        error.contains("step 101: ") && error.contains("gradient in 100 consecutive steps"),
         "{error}"
     );
     let text = String::from_utf8_lossy(&output.stdout);
     assert!(
-        text.contains("warning: step 2: not finite, skipped: "),
+        text.contains("warning: step 2: non-finite loss or gradient, skipped: "),
         "{text}"
     );
     let lines = metrics(&run);
@@ -56,9 +61,9 @@ fn skipped_steps_are_counted_and_too_many_are_the_end() {
     assert_eq!(lines[1]["skipped"], 3);
 }
 
-/// What happens at such a step may be changed on the way.
+/// `train.on_nan` may change at a resume.
 #[test]
-fn a_run_that_stopped_may_go_on_and_skip() {
+fn a_stopped_run_may_resume_and_skip() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let run = dir.path().join("run");
@@ -79,7 +84,7 @@ fn a_run_that_stopped_may_go_on_and_skip() {
 }
 
 #[test]
-fn a_second_process_in_the_directory_is_refused_and_the_first_goes_on() {
+fn a_second_process_in_the_directory_is_refused() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let run = dir.path().join("run");
@@ -94,7 +99,7 @@ fn a_second_process_in_the_directory_is_refused_and_the_first_goes_on() {
         1,
     );
     assert!(
-        error.contains("another process trains in this directory"),
+        error.contains("in use by another training process"),
         "{error}"
     );
     let lines = metrics(&run).len();
@@ -104,9 +109,9 @@ fn a_second_process_in_the_directory_is_refused_and_the_first_goes_on() {
     first.wait().expect("a child");
 }
 
-/// Half-written files of a process that was killed do not pile up.
+/// A resume removes incomplete files of a killed process.
 #[test]
-fn what_a_killed_process_left_half_written_is_swept_away() {
+fn incomplete_files_of_a_killed_process_are_removed() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let run = dir.path().join("run");

@@ -1,4 +1,4 @@
-//! Bytes of a bundle file to header and tensors.
+//! Parses bytes as a bundle file.
 #![no_main]
 
 use demc_fuzz::check_message;

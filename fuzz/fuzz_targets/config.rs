@@ -1,4 +1,4 @@
-//! Text of a configuration, checked, and back.
+//! Parses text as a configuration and writes it again.
 #![no_main]
 
 use std::path::Path;
@@ -15,7 +15,7 @@ fuzz_target!(|text: &str| {
         .collect();
     match Config::parse(Path::new("run.toml"), text, &sets) {
         Ok(config) => {
-            // What is saved with a run resumes it.
+            // A run resumes from its saved configuration.
             let again = Config::parse(Path::new("run.toml"), &config.to_toml(), &[]);
             assert_eq!(again.expect("its own"), config);
             let _ = config.patches_per_step();

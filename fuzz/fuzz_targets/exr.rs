@@ -1,11 +1,11 @@
-//! Bytes of an EXR file to all its channels, and to the checked buffers of a layout.
+//! Reads bytes as an EXR file: all channels, and the checked buffers of a layout.
 #![no_main]
 
 use std::io::Cursor;
 use std::path::Path;
 
 use demc_data::ChannelLayout;
-use demc_data::channel::Kind;
+use demc_data::channel::ChannelType;
 use demc_data::exr::ExrFile;
 use demc_data::frame::{FramePlanes, Presence};
 use demc_fuzz::{allow_caught_panics, check_message};
@@ -26,7 +26,7 @@ fuzz_target!(init: allow_caught_panics(), |bytes: &[u8]| {
             assert_eq!(planes.len(), channels.len());
             for plane in planes {
                 let sizes = channels.iter().map(|c| {
-                    let bytes = if c.kind == Kind::Half { 2 } else { 4 };
+                    let bytes = if c.kind == ChannelType::Half { 2 } else { 4 };
                     c.window.width * c.window.height * bytes
                 });
                 assert!(sizes.into_iter().any(|size| size == plane.bytes()));
@@ -36,7 +36,7 @@ fuzz_target!(init: allow_caught_panics(), |bytes: &[u8]| {
     }
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
     let mut file = open().expect("it opened before");
-    match FramePlanes::decode(&mut file, &layout, Presence::IfThere, Presence::IfThere) {
+    match FramePlanes::decode(&mut file, &layout, Presence::IfPresent, Presence::IfPresent) {
         Ok(planes) => assert_eq!((planes.color.len(), planes.features.len()), (3, 12)),
         Err(error) => check_message(&error, NAME),
     }

@@ -1,4 +1,4 @@
-//! Text of a channel layout to a checked layout, and back.
+//! Parses text as a channel layout and writes it again.
 #![no_main]
 
 use demc_data::ChannelLayout;
@@ -8,7 +8,7 @@ use libfuzzer_sys::fuzz_target;
 fuzz_target!(|text: &str| {
     match ChannelLayout::from_toml("layout.toml", text) {
         Ok(layout) => {
-            // It travels in a bundle's header.
+            // Bundles store it as JSON.
             let json = serde_json::to_string(&layout).expect("plain data");
             assert_eq!(
                 serde_json::from_str::<ChannelLayout>(&json).expect("its own"),

@@ -1,4 +1,4 @@
-//! Bytes of an EXR file to its rewritten self, which has to read back with the same channels.
+//! Rewrites bytes as an EXR file; the output must have the same channels.
 #![no_main]
 
 use std::io::Cursor;
@@ -12,7 +12,7 @@ use demc_data::{ChannelLayout, WriteOptions};
 use demc_fuzz::allow_caught_panics;
 use libfuzzer_sys::fuzz_target;
 
-/// In memory where there is such a directory: a file is written for every input.
+/// A directory in memory if available, because every input writes a file.
 static DIR: LazyLock<PathBuf> = LazyLock::new(|| {
     let memory = Path::new("/dev/shm");
     let parent = if memory.is_dir() {
@@ -43,7 +43,7 @@ fuzz_target!(init: allow_caught_panics(), |bytes: &[u8]| {
     let expected = names(file.channels());
     let output = DIR.join("out.exr");
     let color = vec![0.5; 3 * pixels];
-    // As `demc-infer denoise` does: what reading decoded is kept for writing, here no more than a part of it.
+    // As in `demc-infer denoise`, reading keeps decoded blocks for writing; here only some of them.
     let mut file = file.keeping(&layout, 4096);
     let _ = decode_input(&mut file, &layout);
     if rewrite(&mut file, &layout, &color, &output, &WriteOptions::default()).is_ok() {

@@ -1,12 +1,12 @@
-//! What the targets share.
+//! Shared by the targets.
 
-/// A panic that the library catches (the `exr` crate gives up on damaged data that way) is no finding, but the hook of
-/// `libfuzzer-sys` ends the process before it can be caught. Without a hook, one that nobody catches still ends it.
+/// Allows panics that the library catches; the `exr` crate panics on some damaged data. The hook of
+/// `libfuzzer-sys` would end the process first. Without a hook, an uncaught panic still ends it.
 pub fn allow_caught_panics() {
     std::panic::set_hook(Box::new(|_| {}));
 }
 
-/// Errors are one line that names the file.
+/// Checks that an error is one line that names the file.
 pub fn check_message(error: &dyn std::error::Error, name: &str) {
     let message = error.to_string();
     assert!(!message.contains('\n'), "{message:?}");

@@ -1,4 +1,7 @@
-"""The PyTorch twin of the DEMC Monte Carlo denoiser (Yang et al. 2019): loads and runs what `demc-infer` exports."""
+"""The DEMC Monte Carlo denoiser (Yang et al. 2019) in PyTorch.
+
+It loads and runs the weights that `demc-infer export` writes.
+"""
 
 from .bundle import Bundle, load
 from .metrics import gamma_from_hdr, hdr_from_gamma, rel_mse

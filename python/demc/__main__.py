@@ -1,7 +1,7 @@
-"""`python -m demc BUNDLE` describes an exported bundle; with INPUT and OUTPUT it also runs its network.
+"""Describe an exported bundle, and run its network on INPUT if given.
 
-INPUT is a safetensors file with `color_gamma` [B, 3, H, W] and `features_z` [B, 12, H, W], as the network takes them;
-OUTPUT gets `output` [B, 3, H, W], gamma space.
+INPUT is a safetensors file with the network's inputs: `color_gamma` [B, 3, H, W] and
+`features_z` [B, 12, H, W]. OUTPUT will contain `output` [B, 3, H, W], in gamma space.
 """
 
 import argparse
@@ -16,12 +16,12 @@ from . import load
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m demc", description=__doc__)
-    parser.add_argument("bundle", help="file that demc-infer exported")
-    parser.add_argument("input", nargs="?")
-    parser.add_argument("output", nargs="?")
+    parser.add_argument("bundle", help="file written by demc-infer export")
+    parser.add_argument("input", nargs="?", help="safetensors file with color_gamma and features_z")
+    parser.add_argument("output", nargs="?", help="safetensors file for the output")
     arguments = parser.parse_args()
     if (arguments.input is None) != (arguments.output is None):
-        parser.error("INPUT and OUTPUT go together")
+        parser.error("INPUT requires OUTPUT")
 
     try:
         bundle = load(arguments.bundle)

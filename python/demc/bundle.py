@@ -1,7 +1,7 @@
-"""Exported weights: one safetensors file that `demc-infer export` wrote, and what is needed to denoise with it.
+"""Bundles: safetensors files that `demc-infer export` writes, and denoising with them.
 
-The header's key ``demc`` holds JSON: the model's configuration, the normalisation statistics of the training set, the
-names of the renderer's channels and the training step.
+The header's key ``demc`` contains JSON: the model's configuration, the feature statistics of the
+training set, the names of the renderer's channels, and the training step.
 """
 
 from __future__ import annotations
@@ -23,24 +23,27 @@ from .network import FEATURES, SIZE_MULTIPLE, Denoiser, ModelConfig
 FORMAT = 1
 """The bundle format that this package reads."""
 TORCH_FROM_BURN = {"gamma": "weight", "beta": "bias"}
-"""What differs between the two sets of names: the last part of a batch normalisation's keys."""
+"""Last part of a batch-normalisation key: Burn's name to PyTorch's."""
 
 
 @dataclass
 class Bundle:
-    """A network in eval mode with the normalisation it was trained with."""
+    """A network in eval mode and the statistics of its training set."""
 
     model: Denoiser
     gamma: float
     feature_mean: Tensor  # [12]
     feature_std: Tensor  # [12]
     step: int
-    meta: dict  # the whole header, for those who need more
-    demodulate: float = 0.0  # what is added to the first texture where colour is divided by it; 0: it is not divided
+    meta: dict  # the whole header
+    demodulate: float = 0.0  # epsilon of albedo demodulation; 0: off
 
     def modulation(self, features: Tensor) -> Tensor:
-        """[B, 12, H, W] features as rendered -> [B, 3, H, W], what the network's input colour is divided by and its output
-        multiplied by, in gamma space; ones where `demodulate` is 0."""
+        """The factor of albedo demodulation, in gamma space.
+
+        [B, 12, H, W] features as rendered -> [B, 3, H, W]. The network's input colour is divided by
+        it and its output multiplied by it. All ones if `demodulate` is 0.
+        """
         texture = features[:, 6:9]
         if self.demodulate == 0:
             return torch.ones_like(texture)
@@ -53,17 +56,18 @@ class Bundle:
 
     @torch.inference_mode()
     def denoise(self, color_hdr: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """Denoises one image of any size; padded by edge replication to a multiple of 32 and cropped back.
+        """Denoises one image of any size.
 
-        `color_hdr` is [3, H, W] linear radiance and `features` [12, H, W] as rendered, in the order normal, position,
-        first texture, second texture. Returns [3, H, W] linear radiance, float32.
+        `color_hdr` is [3, H, W] linear radiance. `features` is [12, H, W] as rendered: normal,
+        position, albedo (first hit), albedo (second hit). Returns [3, H, W] linear radiance,
+        float32. Edge pixels are repeated up to a multiple of 32 and cropped afterwards.
         """
         height, width = color_hdr.shape[-2:]
         for what, array, channels in (("color_hdr", color_hdr, 3), ("features", features, FEATURES)):
             if array.shape != (channels, height, width):
                 raise ValueError(f"{what} is {list(array.shape)}: expected [{channels}, {height}, {width}]")
             if not np.isfinite(array).all():
-                raise ValueError(f"{what} holds NaN or infinite values")
+                raise ValueError(f"{what} contains NaN or infinite values")
         device = next(self.model.parameters()).device
         color, feats = (torch.from_numpy(np.float32(a)).to(device)[None] for a in (color_hdr, features))
         pad = (0, -width % SIZE_MULTIPLE, 0, -height % SIZE_MULTIPLE)
@@ -81,23 +85,23 @@ class Bundle:
 
 
 def load(path: str | os.PathLike) -> Bundle:
-    """Reads a bundle with either set of names, in f32 or f16 (which becomes f32). Every tensor must be there and fit.
+    """Reads a bundle with Burn's or PyTorch's tensor names, in f32 or f16; f16 becomes f32.
 
-    Raises OSError where the file cannot be read and ValueError where it is no bundle of this format or its weights are
-    not those of the network that its header describes.
+    Raises OSError if the file cannot be read. Raises ValueError if it is not a bundle of this
+    format, or if its tensors do not match the network in its header.
     """
     try:
         with safe_open(path, framework="pt") as file:
             header = (file.metadata() or {}).get("demc")
             weights = {torch_name_from(name): file.get_tensor(name).float() for name in file.keys()}
     except SafetensorError as error:
-        raise ValueError(f"{path}: cut short, damaged or no safetensors file: {error}") from error
+        raise ValueError(f"{path}: truncated, damaged, or not a safetensors file: {error}") from error
     if header is None:
-        raise ValueError(f"{path}: no key 'demc' in the header: not a file that demc-infer exported")
+        raise ValueError(f"{path}: no key 'demc' in the header: not written by demc-infer export")
     try:
         meta = json.loads(header)
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: header entry 'demc': no JSON: {error}") from error
+        raise ValueError(f"{path}: header entry 'demc': not JSON: {error}") from error
 
     def entry(*keys: str) -> Any:
         value = meta
@@ -129,6 +133,6 @@ def load(path: str | os.PathLike) -> Bundle:
 
 
 def torch_name_from(name: str) -> str:
-    """The PyTorch name of a weight, whichever of the two sets of names `name` comes from."""
+    """The PyTorch name of a weight, from its PyTorch or Burn name."""
     head, _, last = name.rpartition(".")
     return f"{head}.{TORCH_FROM_BURN.get(last, last)}"

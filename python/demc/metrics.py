@@ -1,11 +1,11 @@
-"""The loss, and the way from the network's gamma space back to linear radiance."""
+"""RelMSE, and conversions between gamma space and linear radiance."""
 
 from torch import Tensor
 
 GAMMA = 2.2
 """Exponent of the colour compression (Eq. 4)."""
 EPSILON = 0.001
-"""What keeps RelMSE finite where the reference is black (Eq. 5)."""
+"""Keeps RelMSE finite where the reference is black (Eq. 5)."""
 
 
 def gamma_from_hdr(hdr: Tensor, gamma: float = GAMMA) -> Tensor:
@@ -14,10 +14,10 @@ def gamma_from_hdr(hdr: Tensor, gamma: float = GAMMA) -> Tensor:
 
 
 def hdr_from_gamma(color: Tensor, gamma: float = GAMMA) -> Tensor:
-    """Gamma space -> linear radiance: ``x^gamma``. `color` is the network's output, so not negative."""
+    """Gamma space -> linear radiance: ``x^gamma``. `color` must not be negative."""
     return color**gamma
 
 
 def rel_mse(out_hdr: Tensor, ref_hdr: Tensor, epsilon: float = EPSILON) -> Tensor:
-    """RelMSE of [B, 3, H, W] linear images (Eq. 5): a sum over the 3 channels, a mean over pixels."""
+    """RelMSE of [B, 3, H, W] linear images (Eq. 5): sum over channels, mean over pixels."""
     return ((ref_hdr - out_hdr) ** 2 / (ref_hdr**2 + epsilon)).sum(1).mean()

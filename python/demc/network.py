@@ -1,9 +1,11 @@
 """DEMC, DEMCnoSN, SEMC and color-only as PyTorch modules, in both readings of the paper.
 
-Everything is NCHW. Level i = 1..5 of an encoder has ``width * levels[i - 1]`` channels, (1, 2, 4, 8, 8) in the paper, at
-1, 1/2, 1/4, 1/8 and 1/16 of the input's resolution; the latent sits at 1/32, so heights and widths must be multiples of
-32. Attribute names are the keys of the weight files: renaming one breaks them. Section, equation and figure numbers are
-the paper's.
+Tensors are NCHW. Level i = 1..5 of an encoder has ``width * levels[i - 1]`` channels; `levels` is
+(1, 2, 4, 8, 8) in the paper. The levels have 1, 1/2, 1/4, 1/8 and 1/16 of the input's resolution,
+the latent 1/32. So heights and widths must be multiples of 32.
+
+Attribute names are the keys of the weight files: renaming one breaks them. Section, equation and
+figure numbers are the paper's.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 FEATURES = 12
-"""Feature channels: normal xyz, world position xyz, texture RGB at the 1st and at the 2nd intersection (Sec. 3.1)."""
+"""Normal xyz, world position xyz, albedo RGB (first hit), albedo RGB (second hit) (Sec. 3.1)."""
 SIZE_MULTIPLE = 32
 """Heights and widths must be multiples of this: five max-pools of 2."""
 LEVEL_FACTORS = (1, 2, 4, 8, 8)
@@ -26,14 +28,17 @@ BN_EPSILON = 1e-3
 BN_MOMENTUM = 0.01
 """Share of the new batch in the running statistics: TensorFlow's momentum 0.99."""
 OPEN_BIAS = 1.0
-"""Bias of the detail map's convolution that starts open (ours)."""
+"""Initial bias of the detail map's last convolution if `detail` is "open" (ours)."""
 GREY_HEAD_SCALE = 0.1
-"""What a grey head multiplies its Xavier weights by (ours)."""
+"""Factor of the head's Xavier weights if `head` is "grey" (ours)."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """With or without the fusion sub-network, and what each encoder eats. The last encoder feeds the latent."""
+    """A network variant: fusion sub-network or not, and the inputs of each encoder.
+
+    The last encoder feeds the latent.
+    """
 
     fusion: bool
     encoders: tuple[tuple[str, ...], ...]
@@ -43,14 +48,14 @@ VARIANTS = {
     "demc": Variant(fusion=True, encoders=(("detail",), ("color",))),
     "demc-nosn": Variant(fusion=False, encoders=(("features",), ("color",))),  # Sec. 4.3
     "semc": Variant(fusion=True, encoders=(("detail", "color"),)),  # Sec. 4.4, Fig. 4
-    "color-only": Variant(fusion=False, encoders=(("color",),)),  # a control of ours
+    "color-only": Variant(fusion=False, encoders=(("color",),)),  # ours: a control
 }
 CHANNELS = {"detail": 3, "color": 3, "features": FEATURES}
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What the paper's text and the authors' published model do differently."""
+    """Details in which the paper's text and the authors' published model differ."""
 
     convs: tuple[int, ...]  # convolutions of each encoder level
     skip_after: tuple[int, ...]  # the skip is taken after this many of them
@@ -68,7 +73,7 @@ READINGS = {
 class ModelConfig:
     """The `model` part of a bundle's metadata.
 
-    `head` and `detail` say only how training started: they change no computation.
+    `head` and `detail` only affect the initialisation.
     """
 
     variant: str = "demc"
@@ -99,17 +104,17 @@ class ModelConfig:
         return [self.width * factor for factor in self.levels]
 
     def __str__(self) -> str:
-        """What a person calls it; the levels where they are not the paper's."""
+        """A short name; includes the levels if they are not the paper's."""
         levels = "" if self.levels == LEVEL_FACTORS else f", levels of {self.level_channels}"
         return f"{self.variant}, {self.reading} reading, width {self.width}{levels}"
 
 
 class BatchNorm(nn.Module):
-    """Batch normalisation with the conventions of the Rust side.
+    """Batch normalisation with the conventions of the Rust code.
 
-    Unlike ``nn.BatchNorm2d``, the running variance takes in the *biased* batch variance (as Burn 0.22 and TensorFlow's
-    non-fused operation do; PyTorch and TensorFlow's fused one multiply it by N/(N-1)), and there is no
-    ``num_batches_tracked``.
+    Unlike ``nn.BatchNorm2d``, the running variance averages the *biased* batch variance, as Burn
+    0.22 and TensorFlow's non-fused operation do. PyTorch and TensorFlow's fused operation multiply
+    it by N/(N-1). There is no ``num_batches_tracked``.
     """
 
     def __init__(self, channels: int) -> None:
@@ -134,7 +139,7 @@ def conv3x3(in_channels: int, out_channels: int) -> nn.Conv2d:
 
 
 class FusionBlock(nn.Module):
-    """conv3x3, BatchNorm where `norm`, ReLU."""
+    """conv3x3, BatchNorm if `norm`, ReLU."""
 
     def __init__(self, in_channels: int, out_channels: int, norm: bool) -> None:
         super().__init__()
@@ -147,7 +152,10 @@ class FusionBlock(nn.Module):
 
 
 class Fusion(nn.Module):
-    """The feature fusion sub-network (Sec. 3.2): [B, 12, H, W] Z-scored features -> [B, 3, H, W] detail map."""
+    """The feature fusion sub-network (Sec. 3.2).
+
+    [B, 12, H, W] Z-scored features -> [B, 3, H, W] detail map.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -162,7 +170,10 @@ class Fusion(nn.Module):
 
 
 class EncoderLevel(nn.Module):
-    """Convolutions with ReLU; the skip comes after `skip_after` of them, the max-pool (if `pooled`) after the last."""
+    """Convolutions with ReLU, and a max-pool after the last one if `pooled`.
+
+    The skip is the output of convolution number `skip_after`.
+    """
 
     def __init__(self, in_channels: int, channels: int, convs: int, skip_after: int, pooled: bool) -> None:
         super().__init__()
@@ -170,7 +181,7 @@ class EncoderLevel(nn.Module):
         self.convs = nn.ModuleList(conv3x3(in_channels if j == 0 else channels, channels) for j in range(convs))
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
-        """[B, C, H, W] -> the skip [B, K, H, W] and what the level below gets, [B, K, H/2, W/2]."""
+        """[B, C, H, W] -> the skip [B, K, H, W] and the next level's input [B, K, H/2, W/2]."""
         for j, conv in enumerate(self.convs):
             x = F.relu(conv(x))
             if j + 1 == self.skip_after:
@@ -179,7 +190,7 @@ class EncoderLevel(nn.Module):
 
 
 class Encoder(nn.Module):
-    """Five levels. Without `feeds_latent` (the feature encoder) there are no convolutions after the last skip."""
+    """Five levels. Without `feeds_latent`, the last level ends at its skip."""
 
     def __init__(self, in_channels: int, levels: Sequence[int], reading: Reading, feeds_latent: bool) -> None:
         super().__init__()
@@ -193,7 +204,7 @@ class Encoder(nn.Module):
     def forward(self, x: Tensor) -> tuple[list[Tensor], Tensor | None]:
         """[B, C, H, W] -> the five skips, full resolution first, and the latent's input.
 
-        That is [B, K, H/32, W/32], K the last level's channels.
+        The latent's input is [B, K, H/32, W/32]; K is the number of channels of the last level.
         """
         skips = []
         for level in self.levels:
@@ -216,7 +227,10 @@ class Latent(nn.Module):
 
 
 class DecoderLevel(nn.Module):
-    """Deconvolution to twice the size, then the 1x1 fusion of ``[decoder | feature skip | HDR skip]`` (Eq. 2)."""
+    """Deconvolution to twice the size, then a 1x1 convolution of ``[decoder | feature skip | HDR skip]``.
+
+    Eq. 2 of the paper.
+    """
 
     def __init__(self, in_channels: int, channels: int, skips: int, reading: Reading) -> None:
         super().__init__()
@@ -243,18 +257,21 @@ class Decoder(nn.Module):
         self.head = conv3x3(levels[0], 3)
 
     def forward(self, latent: Tensor, skips: Sequence[Sequence[Tensor]]) -> Tensor:
-        """The latent and, for each encoder, its five skips (full resolution first) -> [B, 3, H, W], >= 0."""
+        """The latent, and the five skips of each encoder, full resolution first -> [B, 3, H, W], >= 0."""
         for level, level_skips in zip(self.levels, reversed(list(zip(*skips)))):
             latent = level(latent, level_skips)
         return F.relu(self.head(latent))
 
 
 class Denoiser(nn.Module):
-    """The whole network. ``Denoiser(config)`` is initialised as a training run starts (Sec. 4.2), head included."""
+    """The whole network, with the initialisation of a training run (Sec. 4.2)."""
 
     def __init__(self, config: ModelConfig = ModelConfig(), head_bias: Sequence[float] = (0.3, 0.3, 0.3)) -> None:
-        """`head_bias` is what a grey head starts from: the flat colour, in gamma space, with the least RelMSE on the
-        training set."""
+        """`head_bias` is the initial bias of a grey head.
+
+        A training run uses the flat colour with the least RelMSE on its training set, in gamma
+        space.
+        """
         super().__init__()
         self.config = config
         self.variant = VARIANTS[config.variant]
@@ -270,7 +287,10 @@ class Denoiser(nn.Module):
         self._initialise(head_bias)
 
     def forward(self, color_gamma: Tensor, features_z: Tensor) -> Tensor:
-        """[B, 3, H, W] gamma-space colour and [B, 12, H, W] Z-scored features -> [B, 3, H, W], gamma space, >= 0."""
+        """Gamma-space colour [B, 3, H, W] and Z-scored features [B, 12, H, W] -> [B, 3, H, W].
+
+        The output is in gamma space and not negative.
+        """
         planes = {"color": color_gamma, "features": features_z}
         if self.fusion is not None:
             planes["detail"] = self.fusion(features_z)
@@ -281,7 +301,7 @@ class Denoiser(nn.Module):
         return self.decoder(self.latent(pooled), skips)
 
     def detail_map(self, features_z: Tensor) -> Tensor | None:
-        """[B, 12, H, W] -> [B, 3, H, W] (Fig. 2 e); None where the variant has no fusion sub-network."""
+        """[B, 12, H, W] -> [B, 3, H, W] (Fig. 2 e); None if the variant has no fusion sub-network."""
         return None if self.fusion is None else self.fusion(features_z)
 
     @torch.no_grad()
@@ -304,6 +324,6 @@ class Denoiser(nn.Module):
 
 
 def bilinear_kernel(in_channels: int, out_channels: int) -> Tensor:
-    """Weight [in, out, 4, 4] of a deconvolution that up-samples bilinearly, channel by channel (Sec. 4.2)."""
+    """Weight [in, out, 4, 4] of a deconvolution that upsamples each channel bilinearly (Sec. 4.2)."""
     line = torch.tensor([0.25, 0.75, 0.75, 0.25])
     return torch.eye(in_channels, out_channels)[:, :, None, None] * torch.outer(line, line)

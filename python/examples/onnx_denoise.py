@@ -1,4 +1,4 @@
-"""Denoises an image with a file that `demc-infer export --format onnx` wrote: MODEL.onnx IN.exr OUT.exr
+"""Denoises an image with an ONNX file of `demc-infer export`: MODEL.onnx IN.exr OUT.exr
 
 pip install numpy onnxruntime OpenEXR
 """
@@ -17,7 +17,7 @@ channels = OpenEXR.File(source, separate_channels=True).channels()
 
 
 def planes(*buffers):
-    """[1, C, H, W] of a layout's buffers, sides repeated to multiples of 32."""
+    """Buffers of the layout, [1, C, H, W]; edges repeated to multiples of 32."""
     image = np.stack([channels[name].pixels for buffer in buffers for name in layout[buffer]])
     height, width = image.shape[1:]
     return np.pad(image, ((0, 0), (0, -height % 32), (0, -width % 32)), "edge")[None].astype("f4")

@@ -1,6 +1,6 @@
-"""Denoises an image with a file that `demc-infer export` wrote, in PyTorch: MODEL.safetensors IN.exr OUT.exr
+"""Denoises an image in PyTorch with a bundle of `demc-infer export`: MODEL.safetensors IN.exr OUT.exr
 
-pip install ./python OpenEXR, from the repository's root
+pip install ./python OpenEXR (in the repository root)
 """
 
 import sys
@@ -16,7 +16,7 @@ channels = OpenEXR.File(source, separate_channels=True).channels()
 
 
 def planes(*buffers):
-    """[C, H, W] of a layout's buffers."""
+    """Buffers of the layout, [C, H, W]."""
     return np.stack([channels[name].pixels for buffer in buffers for name in layout[buffer]])
 
 

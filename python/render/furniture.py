@@ -1,4 +1,4 @@
-"""Furniture and what stands on it: boxes, rods and balls at a place on a floor, whose z is up."""
+"""Furniture and things on it, made of boxes, rods, and balls; z is up."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Furnished(Stage):
             self.box([-0.18, -0.06, -0.16], [0.18, 0.06, 0.16], self.any_material(), leaning)
 
     def heap(self, place) -> None:
-        """Boxes over each other."""
+        """Stacked boxes."""
         rng, z = self.rng, 0.0
         side = rng.uniform(0.2, 0.6)
         for _ in range(rng.integers(1, 5)):
@@ -94,7 +94,7 @@ class Furnished(Stage):
         self.box([-w, -d, 0], [w, d, 0.012], self.material(plain=True), place)
 
     def thing(self, place) -> None:
-        """Something to stand on a table."""
+        """A small object on a table."""
         rng, bsdf, kind = self.rng, self.any_material(), self.rng.integers(5)
         r, h = rng.uniform(0.03, 0.1), rng.uniform(0.06, 0.3)
         if kind == 0:

@@ -1,4 +1,4 @@
-"""What a room is painted with, as arrays of numbers: colours, textures, pictures and the sky outside."""
+"""Random colours, textures, pictures, and skies, as arrays."""
 
 from __future__ import annotations
 
@@ -9,17 +9,20 @@ from variant import mi
 
 Rng = np.random.Generator
 TEXTURE_SIDE = 256
-"""Pixels of a texture."""
+"""Height and width of a texture, in pixels."""
 
 
 def color(rng: Rng) -> list[float]:
-    """A reflectance: mostly muted, seldom bright and pure."""
+    """A reflectance: mostly muted, rarely bright and saturated."""
     saturation = rng.beta(1.0, 3.5)
     return [float(c) for c in colorsys.hsv_to_rgb(rng.random(), saturation, rng.uniform(0.1, 0.9))]
 
 
 def sky(rng: Rng, brightness: float, skyline: bool = False) -> dict:
-    """An environment map: a gradient with clouds, a sun of one or a few degrees in three of four, and with a `skyline` buildings before it."""
+    """An environment map: a gradient with clouds, and buildings if `skyline`.
+
+    Three of four have a sun with a radius of 1 to 5 degrees.
+    """
     height, width = 256, 512
     up = np.linspace(1, -1, height)[:, None, None]
     zenith = np.array([rng.uniform(0.5, 1), rng.uniform(0.7, 1), 1.0]) * rng.uniform(0.4, 1)
@@ -41,7 +44,7 @@ def sky(rng: Rng, brightness: float, skyline: bool = False) -> dict:
 
 
 def studio(rng: Rng) -> dict:
-    """An environment map that is black but for one to four lamps above: what is behind the things stays black to the last bit."""
+    """An environment map with one to four lamps above, exactly black elsewhere."""
     height, width = 256, 512
     image = np.zeros((height, width, 3))
     for _ in range(rng.integers(1, 5)):
@@ -55,14 +58,14 @@ def studio(rng: Rng) -> dict:
 
 
 def environment(image: np.ndarray) -> dict:
-    """What shines from all around, `[height, width, 3]` from the zenith down."""
-    # Mitsuba's maps have y up.
+    """An environment emitter; the image is `[height, width, 3]`, zenith first."""
+    # Mitsuba's environment maps have y up.
     to_world = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
     return {"type": "envmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "to_world": to_world}
 
 
 def built(rng: Rng, image: np.ndarray) -> np.ndarray:
-    """The environment map `[height, width, 3]` with blocks with windows along its horizon, and something coarse for the ground; changed in place."""
+    """Adds buildings along the horizon and a coarse ground to a map `[height, width, 3]`, in place."""
     height, width, _ = image.shape
     horizon, left = height // 2, 0
     bumps = noise(rng, height, width, 6)[..., None]
@@ -80,7 +83,7 @@ def built(rng: Rng, image: np.ndarray) -> np.ndarray:
 
 
 def noise(rng: Rng, height: int, width: int, octaves: int) -> np.ndarray:
-    """Smooth noise in 0..1 that repeats at the edges, `[height, width]`."""
+    """Smooth periodic noise from 0 to 1, `[height, width]`."""
     total, weight = np.zeros((height, width)), 0.0
     for octave in range(octaves):
         cells = 4 << octave
@@ -118,7 +121,7 @@ def pattern(rng: Rng, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def grain(rng: Rng) -> np.ndarray:
-    """What boards, stone or cloth do to a colour: factors around 0.8 with detail down to the texel, `[256, 256, 1]`."""
+    """Boards, stone, or cloth: factors of a colour around 0.8, with detail in every texel, `[256, 256, 1]`."""
     n = TEXTURE_SIDE
     y, x = np.mgrid[0:n, 0:n] / n
     kind = rng.choice(["boards", "stone", "cloth"], p=[0.55, 0.3, 0.15])
@@ -142,7 +145,7 @@ def grain(rng: Rng) -> np.ndarray:
 
 
 def mosaic(rng: Rng, colors: list) -> np.ndarray:
-    """A picture: the nearest of some points says which colour."""
+    """A picture of Voronoi cells."""
     n = TEXTURE_SIDE
     y, x = np.mgrid[0:n, 0:n] / n
     points = rng.random((rng.integers(4, 40), 2))

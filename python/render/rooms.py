@@ -1,6 +1,6 @@
-"""Furnished rooms out of nothing but a seed: patterns for textures, light through windows and from lamps.
+"""Random furnished rooms, lit through windows or by lamps.
 
-Lengths are metres, z is up, the floor is z = 0 and the room's corner the origin.
+Lengths are in metres, z is up, the floor is at z = 0, and the room's corner is the origin.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ class Room(Furnished):
         super().__init__(rng, grained, grains)
         self.targets: list[np.ndarray] = []
         self.frames: list[dict] = []
-        """What bars, blinds and curtains are made of."""
+        """Materials of bars, blinds, and curtains."""
         self.open_sides: list[int] = []
-        """Walls with windows, by number: 0 is that along the x axis, and so on around."""
+        """Numbers of the walls with windows; 0 is the wall along the x axis."""
 
         windows = rng.random() < 0.75
         self.shell(windows)
@@ -34,7 +34,7 @@ class Room(Furnished):
     # The shell.
 
     def shell(self, windows: bool) -> None:
-        """Floor, ceiling and four walls, one to three of them with windows."""
+        """Floor, ceiling, and four walls; with `windows`, one to three of them have windows."""
         rng, (x, y, z) = self.rng, self.size
         self.box([0, 0, -0.1], [x, y, 0], self.material())
         self.box([0, 0, z], [x, y, z + 0.1], {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": float(rng.uniform(0.5, 0.9))}}})
@@ -43,7 +43,7 @@ class Room(Furnished):
         for side in range(4):
             length = x if side % 2 == 0 else y
             turned = mi.ScalarTransform4f()
-            # A wall lies along its own x axis, inside towards +y.
+            # In its own coordinates a wall lies along x, with the room on the +y side.
             corner = [(0, 0), (x, 0), (x, y), (0, y)][side]
             turned = turned.translate([corner[0], corner[1], 0]).rotate([0, 0, 1], 90 * side)
             bsdf = wall if rng.random() < 0.7 else other
@@ -55,7 +55,7 @@ class Room(Furnished):
                     self.pictures(length, z, turned)
 
     def windows(self, length: float, height: float, wall: dict, place) -> None:
-        """A wall of windows: what is left of it, frames, and blinds, bars or curtains before some."""
+        """A wall with windows: the wall around them, and blinds, bars, or curtains."""
         rng = self.rng
         most = max(1, int(length / 1.3))
         count = int(rng.integers((most + 1) // 2, most + 1))
@@ -101,7 +101,7 @@ class Room(Furnished):
             self.box([x, 0.03, z], [x + w, 0.035, z + h], {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": canvas}}, place)
 
     def lamps(self) -> None:
-        """Panels under the ceiling, hanging or standing globes."""
+        """Ceiling panels, and hanging or standing globes."""
         rng, (x, y, z) = self.rng, self.size
         warm = np.array([1, rng.uniform(0.7, 1), rng.uniform(0.4, 1)])
         for _ in range(rng.integers(1, 5)):
@@ -120,11 +120,11 @@ class Room(Furnished):
                 self.rod([*at, height + radius if hanging else 0], [*at, z if hanging else height - radius], 0.015, self.any_material())
 
     def sun(self, rng: Rng) -> None:
-        """A sun without width that shines in through windows, where there are any: hard shadows of frames and blinds."""
+        """A directional sun through a window, if the room has one: hard shadows of frames and blinds."""
         if not self.open_sides:
             return
         elevation = np.radians(rng.uniform(10, 55))
-        # Wall 0 looks out along -y.
+        # The outside of wall 0 is at -y.
         azimuth = np.radians(90 * (rng.choice(self.open_sides) - 1) + rng.uniform(-55, 55))
         towards = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         power = np.exp(rng.uniform(np.log(2), np.log(60)))
@@ -136,7 +136,10 @@ class Room(Furnished):
         }
 
     def blacken(self, rng: Rng) -> None:
-        """Makes bars and blinds black, and what else is of their material: no colour is, and slats before a bright sky often are."""
+        """Makes bars and blinds black, and everything else of their material.
+
+        `color` yields no black, but real slats in front of a bright sky are often black.
+        """
         reflectance = {"type": "rgb", "value": float(rng.uniform(0, 0.02))}
         black = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
         for shape in self.scene.values():
@@ -150,7 +153,7 @@ class Room(Furnished):
         kinds = [self.table, self.table, self.chair, self.chair, self.shelf, self.sofa, self.heap, self.plant, self.rug, self.post]
         rows = rng.random() < 0.3
         if rows:
-            # A classroom or a restaurant: one kind of furniture in rows.
+            # A classroom or a restaurant: equal furniture in rows.
             pitch = rng.uniform(1.1, 2.0, 2)
             seed = int(rng.integers(1 << 31))
             kept, angle = self.rng, float(rng.choice([0, 90, 180, 270]))
@@ -176,7 +179,7 @@ class Room(Furnished):
     # Views.
 
     def camera(self, rng: Rng, side: int) -> dict:
-        """A view from inside: at a piece of furniture, or across the room."""
+        """A view from inside, at a piece of furniture or across the room."""
         low, high = 0.12 * self.size, 0.88 * self.size
         low[2], high[2] = 0.7, min(2.1, self.size[2] - 0.3)
         eye = rng.uniform(low, high)

@@ -1,4 +1,4 @@
-"""A Mitsuba scene that grows shape by shape, and what it is painted with."""
+"""A Mitsuba scene under construction, and its materials."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ METALS = ("Al", "Ag", "Au", "Cu", "Cr", "W")
 
 
 def tiled(image: np.ndarray, times: float) -> dict:
-    """A texture that repeats so many times along either side of what it covers."""
+    """A texture that repeats `times` times along either side of its surface."""
     transform = mi.ScalarTransform3f().scale([times, times])
     return {"type": "bitmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "raw": True, "to_uv": transform}
 
 
 def square_film(side: int) -> dict:
-    """Of `side` x `side` pixels, each the mean of its own samples."""
+    """A film of `side` x `side` pixels with a box filter."""
     return {"type": "hdrfilm", "width": side, "height": side, "rfilter": {"type": "box"}}
 
 
 class Stage:
-    """Materials to choose from, and shapes made of them.
+    """Materials, and shapes made of them.
 
-    A share of what it is painted with has a grain, by numbers of its own: all else is the same without.
+    A share `grained` of colours and patterns has a grain. Grains use the separate generator
+    `grains`, so everything else is the same without them.
     """
 
     def __init__(self, rng: Rng, grained: float = 0.0, grains: Rng | None = None) -> None:
@@ -35,11 +36,11 @@ class Stage:
     # Materials.
 
     def tint(self) -> list[float]:
-        """One of the room's own colours, or any."""
+        """A colour of the palette or a random one."""
         return self.palette[self.rng.integers(len(self.palette))] if self.rng.random() < 0.7 else color(self.rng)
 
     def paint(self) -> dict:
-        """A colour, or a pattern of two."""
+        """A colour, or a pattern of two colours."""
         grained = self.grains is not None and self.grains.random() < self.grained
         if self.rng.random() < 0.45:
             tint = self.tint()

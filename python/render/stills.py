@@ -1,6 +1,6 @@
-"""Still lifes out of nothing but a seed: things on a table, or furniture on a square, under the sky, mostly out of focus somewhere.
+"""Random still lifes: things on a table or furniture on a square, under the sky, mostly with defocus.
 
-Lengths are metres, z is up, and the things stand around the origin on z = 0.
+Lengths are in metres, z is up, and the things stand around the origin at z = 0.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from stage import square_film, tiled
 from variant import mi
 
 RINGS, SEGMENTS = 40, 48
-"""Of a turned surface."""
+"""Resolution of a surface of revolution."""
 
 
 class Still(Furnished):
@@ -22,18 +22,21 @@ class Still(Furnished):
         super().__init__(rng, grained, grains)
         self.square = rng.random() < 0.4
         self.reach = float(rng.uniform(1.5, 5) if self.square else rng.uniform(0.2, 0.6))
-        """How far from the origin things stand."""
+        """Largest distance of a thing from the origin."""
         self.walled = rng.random() < (0.2 if self.square else 0.4)
         self.ground()
         self.scene["sky"] = sky(rng, 1.0, skyline=rng.random() < 0.6)
         self.arrange()
 
     def darken(self, rng: Rng) -> None:
-        """Lamps in a black studio for the sky."""
+        """Replaces the sky by lamps in a black studio."""
         self.scene["sky"] = studio(rng)
 
     def surface(self, side: float) -> dict:
-        """A material for `side` metres of floor: a pattern with detail down to a texel of a few millimetres, or centimetres on a square."""
+        """A material for `side` metres of floor.
+
+        Texels of its pattern measure millimetres on a table and centimetres on a square.
+        """
         rng = self.rng
         image = pattern(rng, np.array(self.tint()), np.array(self.tint()))
         if rng.random() < 0.75:
@@ -46,7 +49,7 @@ class Still(Furnished):
         return {"type": "twosided", "bsdf": gloss}
 
     def ground(self) -> None:
-        """A table's top or a square, and a wall behind."""
+        """A table top or a square, and in some scenes a wall behind it."""
         rng = self.rng
         half = self.reach * float(rng.uniform(3, 8) if self.square else rng.choice([rng.uniform(1.2, 2), rng.uniform(3, 6)]))
         flat = mi.ScalarTransform4f().scale([half, half, 1])
@@ -67,7 +70,7 @@ class Still(Furnished):
             if self.square:
                 pieces[rng.integers(len(pieces))](place)
             else:
-                # Toys of furniture, too.
+                # Some furniture is toy-sized.
                 kind = rng.random()
                 small = float(rng.uniform(0.1, 0.25))
                 if kind < 0.4:
@@ -84,13 +87,13 @@ class Still(Furnished):
         self.ball([0, 0, height], radius * rng.uniform(1, 1.6), self.any_material(), place)
 
     def vase(self, place) -> None:
-        """A turned surface: bottles, bowls, pawns."""
+        """A surface of revolution: bottles, bowls, pawns."""
         rng = self.rng
         height = self.reach * float(np.exp(rng.uniform(np.log(0.15), np.log(0.7))))
         width = height * float(rng.uniform(0.15, 0.6))
         knots = rng.uniform(0.15, 1, rng.integers(3, 8))
         t = np.linspace(0, 1, RINGS)
-        # Smooth between the knots; both ends are closed.
+        # Cosine interpolation between the knots; both ends are closed.
         at = t * (len(knots) - 1)
         low = np.minimum(at.astype(int), len(knots) - 2)
         share = (1 - np.cos(np.pi * (at - low))) / 2
@@ -100,7 +103,7 @@ class Still(Furnished):
         self.turned(radius, z, place)
 
     def turned(self, radius: np.ndarray, z: np.ndarray, place) -> None:
-        """The surface that the profile sweeps around z."""
+        """The surface of revolution of a profile around z."""
         angle = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
         points = np.stack(
             [
@@ -128,9 +131,9 @@ class Still(Furnished):
         self.scene[f"shape{len(self.scene)}"] = mesh
 
     def camera(self, rng: Rng, side: int) -> dict:
-        """A view at the things from above, through a lens in two of three."""
+        """A view from above; two of three have a thin lens."""
         elevation = np.radians(rng.uniform(4, 30) if self.square else rng.uniform(10, 55))
-        # From before the wall, where there is one.
+        # In front of the wall, if any.
         azimuth = np.radians(rng.uniform(-150, -30)) if self.walled else rng.uniform(0, 2 * np.pi)
         distance = self.reach * rng.uniform(1.2, 3)
         eye = distance * np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])

@@ -1,7 +1,8 @@
-"""A path tracer on Mitsuba 3 that returns the twelve feature channels with the colour: normal, position and texture at a path's first
-vertex, texture at its second (Sec. 3.1). Mitsuba's own `aov` integrator has no second vertex.
+"""A path tracer on Mitsuba 3 that returns colour and the twelve feature channels (Sec. 3.1).
 
-Emitters and BSDFs are sampled and weighed by the power heuristic; Russian roulette begins at the third vertex.
+Features are normal, position, and albedo at a path's first vertex, and albedo at its second.
+Mitsuba's own `aov` integrator has no second vertex. Emitters and BSDFs are sampled and weighted by
+the power heuristic; Russian roulette starts at the third vertex.
 """
 
 from __future__ import annotations
@@ -13,18 +14,18 @@ import numpy as np
 from variant import mi
 
 MAX_DEPTH = 8
-"""Vertices of a path, the camera not counted."""
+"""Largest number of vertices of a path, without the camera."""
 ROULETTE_DEPTH = 3
-"""Paths may end from this vertex on."""
+"""Vertex at which Russian roulette starts."""
 LARGEST_WAVEFRONT = 1 << 21
-"""Paths traced at once: some 300 bytes each."""
+"""Largest number of paths traced at once; each takes about 300 bytes."""
 FEATURES = ("normal", "position", "albedo1", "albedo2", "mask")
-"""What a path says about its first two vertices, in the order in which `trace` returns it."""
+"""Features of the first two vertices, in the order in which `trace` returns them."""
 
 
 @dataclass
 class Samples:
-    """Sums over the samples of each pixel, `[H, W, C]` float64: divide by `count`."""
+    """Sums over the samples of each pixel, `[H, W, C]` float64. Dividing by `count` gives means."""
 
     color: np.ndarray
     features: dict[str, np.ndarray]
@@ -32,9 +33,9 @@ class Samples:
 
 
 def render(scene: mi.Scene, samples: int, seed: int, clamp: float = np.inf, view: int = 0) -> Samples:
-    """Traces `samples` paths through each pixel of the scene's sensor number `view`: box filter, independent sampler.
+    """Traces `samples` paths per pixel of sensor number `view`: box filter, independent sampler.
 
-    `clamp` bounds what one sample sees beyond emitters in direct view, in the scene's own radiance.
+    `clamp` limits the radiance of a sample, without emitters seen directly.
     """
     sensor = scene.sensors()[view]
     width, height = (int(side) for side in sensor.film().crop_size())
@@ -53,9 +54,9 @@ def trace_pixels(scene, sensor, width: int, height: int, count: int, seed: int, 
     """Sums over `count` paths of each pixel, `[H * W, C]` float64."""
     paths = width * height * count
     sampler = mi.load_dict({"type": "independent"})
-    # Mitsuba hashes a seed and an index: neighbours are not correlated.
+    # Mitsuba hashes seed and index: neighbouring seeds are not correlated.
     sampler.seed(seed % (1 << 32), paths)
-    # Opaque: one kernel for any number of samples.
+    # Opaque: one compiled kernel for any number of samples.
     pixel = dr.arange(mi.UInt32, paths) // dr.opaque(mi.UInt32, count)
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
     film = (corner + sampler.next_2d()) / mi.ScalarPoint2f(width, height)
@@ -67,7 +68,7 @@ def trace_pixels(scene, sensor, width: int, height: int, count: int, seed: int, 
     for name, value in zip(FEATURES, features):
         channels[name] = [*value] if name != "mask" else [value]
     channels = {name: [mi.Float(plane) + dr.zeros(mi.Float, paths) for plane in planes] for name, planes in channels.items()}
-    # All at once: a sum evaluates what it sums, and sixteen of them would trace each path sixteen times.
+    # Evaluates all at once: otherwise each of the 16 sums would trace every path again.
     dr.eval(channels)
     sums = {name: [dr.block_sum(plane, count).numpy() for plane in planes] for name, planes in channels.items()}
     return {name: np.stack(planes, axis=-1).astype(np.float64) for name, planes in sums.items()}
@@ -90,7 +91,7 @@ def trace(scene, sampler, ray, clamp):
         bsdf = si.bsdf(ray)
         emitter = si.emitter(scene)
 
-        # What the vertex itself emits, weighed against having sampled it as a light.
+        # Emission of the vertex, weighted against sampling it as a light.
         direction = mi.DirectionSample3f(scene, si, before)
         light_pdf = mi.Float(0)
         if ~before_delta:
@@ -141,19 +142,19 @@ def trace(scene, sampler, ray, clamp):
 
     finite = dr.isfinite(mi.luminance(radiance))
     radiance = dr.select(finite, radiance, 0)
-    # Brightness is bounded, the hue is kept.
+    # Limits the brightness and keeps the hue.
     radiance *= dr.minimum(1, clamp / dr.maximum(dr.max(radiance), 1e-12))
     return radiance + seen, (normal, position, albedo1, albedo2, mask)
 
 
 def power(a: mi.Float, b: mi.Float) -> mi.Float:
-    """The power heuristic's weight of the technique with density `a`."""
+    """Weight of the technique with density `a` (power heuristic)."""
     a, b = a * a, b * b
     return dr.select(a > 0, a / (a + b), 0)
 
 
 def albedo(bsdf, si, sample_weight, emitter, active):
-    """Diffuse reflectance where there is one, else the specular tint; emitters and sky: what they emit, at most 1."""
+    """Diffuse reflectance, or else the specular tint; emission, at most 1, for emitters and sky."""
     diffuse = bsdf.eval_diffuse_reflectance(si, active)
     tint = dr.clip(sample_weight, 0, 1)
     surface = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse), diffuse, tint)

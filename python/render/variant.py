@@ -1,10 +1,10 @@
-"""Mitsuba with its just-in-time compiler, set up before anything of it is used."""
+"""Mitsuba with its just-in-time compiler. Import it from here, so that its variant is set."""
 
 import os
 from glob import glob
 
 if newest := sorted(glob("/usr/lib/*/libLLVM.so.[0-9]*"), key=lambda path: float(path.rpartition(".so.")[2])):
-    # Dr.Jit takes any: LLVM 15 cannot compile these kernels for AVX-512.
+    # Dr.Jit takes any version, but LLVM 15 cannot compile these kernels for AVX-512.
     os.environ.setdefault("DRJIT_LIBLLVM_PATH", newest[-1])
 
 import mitsuba as mi  # noqa: E402

@@ -1,4 +1,4 @@
-"""One view as training needs it: a noisy image with its features, a reference from other samples, and how noisy both are."""
+"""One training view: noisy image, features, reference from other samples, and the noise of both."""
 
 from __future__ import annotations
 
@@ -12,44 +12,44 @@ import OpenEXR
 import tracer
 
 LUMINANCE = 0.22
-"""What the mean luminance is scaled to, without the brightest pixels."""
+"""Mean luminance after scaling, without the brightest pixels."""
 TRIMMED = 0.02
-"""Share of the pixels that are the brightest."""
+"""Share of the brightest pixels that the mean excludes."""
 CLAMP = 45.0
-"""What a sample may bring at most, in units of that mean."""
+"""Upper limit of a sample, in units of that mean."""
 PROBE_SAMPLES = 8
-"""Samples a pixel that the mean is taken from."""
+"""Samples per pixel for measuring the mean."""
 PASS_SAMPLES = 16
-"""Samples a pixel of one pass of the reference; passes go to two halves in turn."""
+"""Samples per pixel of one pass of the reference. Passes alternate between two halves."""
 EPSILON = 0.001
-"""Eq. 5."""
+"""Epsilon of RelMSE (Eq. 5)."""
 CHANNELS = {"normal.": "XYZ", "position.": "XYZ", "albedo1.": "RGB", "albedo2.": "RGB", "mask.": "A"}
 GUIDES = ("normal", "albedo1")
-"""Features that the reference keeps of its own samples, for `tools/references.py`."""
+"""Features of the reference's own samples that are written, for `tools/references.py`."""
 
 
 class Unsuitable(Exception):
-    """Nothing can be learnt from the view."""
+    """The view is useless for training."""
 
 
 @dataclass
 class Budget:
-    """What a view may cost."""
+    """Limits of a view's samples and noise."""
 
     samples: int
-    """Of the noisy image."""
+    """Samples per pixel of the noisy image."""
     ref_samples: int
-    """Of the reference, at most."""
+    """Largest number of samples per pixel of the reference."""
     residual: float
-    """RelMSE of the reference against a perfect one that is enough."""
+    """Expected RelMSE of the reference at which it is good enough."""
     noise: tuple[float, float] = (0.0, np.inf)
-    """RelMSE of the noisy image, least and most."""
+    """Smallest and largest RelMSE of the noisy image."""
     near: float = 0.0
-    """A view with more than three of ten pixels nearer than this looks at a wall."""
+    """A view is blocked if more than 30 % of its pixels are nearer than this, in scene units."""
 
 
 def photograph(scene, view: int, seed: int, budget: Budget) -> tuple[dict[str, np.ndarray], dict]:
-    """Channels of the EXR file, `[H, W]` each, and what is said about them in the manifest."""
+    """Channels of the EXR file, `[H, W]` each, and facts for the manifest."""
     probe = tracer.render(scene, PROBE_SAMPLES, seed, view=view)
     luminance = np.sort((probe.color / probe.count @ [0.2126, 0.7152, 0.0722]).ravel())
     mean = luminance[: int(len(luminance) * (1 - TRIMMED))].mean()
@@ -113,13 +113,13 @@ def rel_mse(difference: np.ndarray, reference: np.ndarray) -> float:
 
 
 def too_coarse(position: np.ndarray) -> bool:
-    """Whether a half's step is more than a thousandth of what is seen."""
+    """Whether the step of a 16-bit float exceeds a thousandth of the visible extent."""
     step = float(np.spacing(np.float16(min(np.abs(position).max(), 6e4))))
     return np.abs(position).max() > 6e4 or step > np.ptp(position, axis=(0, 1)).max() / 1000
 
 
 def write(path: Path, channels: dict[str, np.ndarray], entry: dict) -> None:
-    """The EXR file, whole or not at all. Its header repeats the manifest's entry."""
+    """Writes the EXR file completely or not at all. Its header contains the manifest's entry."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "demc": json.dumps(entry)}
     unfinished = path.with_name(f".{path.name}.unfinished")
     OpenEXR.File(header, channels).write(str(unfinished))
@@ -127,6 +127,6 @@ def write(path: Path, channels: dict[str, np.ndarray], entry: dict) -> None:
 
 
 def entry_of(path: Path) -> dict:
-    """What a file's header repeats."""
+    """The manifest's entry in a file's header."""
     with OpenEXR.File(str(path), header_only=True) as file:
         return json.loads(file.header()["demc"])

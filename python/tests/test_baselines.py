@@ -1,6 +1,7 @@
-"""`tools/baselines.py` and `tools/references.py` on the repository's sample: `python -m unittest discover -s tests`, in `python/`.
+"""Tests of `tools/baselines.py` and `tools/references.py` on data/sample.
 
-Skipped without what the tools need (numpy, OpenEXR, pyoidn, scikit-image, PyWavelets), unless DEMC_REQUIRE_BASELINES=1.
+Run `python -m unittest discover -s tests` in `python/`. The tests are skipped without the tools'
+packages (numpy, OpenEXR, pyoidn, scikit-image, PyWavelets), unless DEMC_REQUIRE_BASELINES=1.
 """
 
 import importlib.util
@@ -24,7 +25,7 @@ def run(tool: str, *arguments: object) -> subprocess.CompletedProcess:
 
 @unittest.skipIf(MISSING and os.environ.get("DEMC_REQUIRE_BASELINES") != "1", f"no {', '.join(MISSING)}")
 class Tools(unittest.TestCase):
-    """The tools' own directory comes first."""
+    """Puts the tools' folder first on the path."""
 
     def setUp(self) -> None:
         sys.path.insert(0, str(TOOLS))
@@ -33,7 +34,7 @@ class Tools(unittest.TestCase):
 
 class Baselines(Tools):
     def relmse(self, denoiser: str) -> list[tuple[float, float]]:
-        """RelMSE of the noisy and of the denoised image, by scene."""
+        """RelMSE of the noisy and of the denoised image, per scene."""
         import numpy as np
         from dataset import Scene
 
@@ -51,7 +52,7 @@ class Baselines(Tools):
                 scores.append((error(scene.rgb("")), error(clean.rgb(""))))
         return scores
 
-    def test_open_image_denoise_takes_most_of_the_error_away(self) -> None:
+    def test_open_image_denoise_removes_most_of_the_error(self) -> None:
         for noisy, clean in self.relmse("oidn"):
             self.assertLess(clean, 0.1 * noisy)
 
@@ -63,7 +64,7 @@ class Baselines(Tools):
         self.assertLess(prefilter, color)
         self.assertLess(features, color)
 
-    def test_non_local_means_takes_some_of_the_error_away(self) -> None:
+    def test_non_local_means_removes_some_of_the_error(self) -> None:
         for noisy, clean in self.relmse("nlm"):
             self.assertLess(clean, 0.9 * noisy)
 
@@ -76,7 +77,7 @@ class Baselines(Tools):
 
 
 class References(Tools):
-    def test_training_references_are_cleaner_and_all_else_is_as_it_was(self) -> None:
+    def test_only_training_references_change_and_they_are_cleaner(self) -> None:
         import numpy as np
         from dataset import Scene, manifest
         from references import noise
@@ -103,16 +104,16 @@ class References(Tools):
                 self.assertLess(level(clean), level(raw))
                 self.assertLess(abs(clean.mean() / raw.mean() - 1), 0.02)
 
-    def test_what_the_samples_say_is_black_stays_dark(self) -> None:
+    def test_black_samples_stay_dark(self) -> None:
         import numpy as np
         from references import clean
 
-        # Bars of one pixel before a window, which Open Image Denoise by itself lightens.
+        # One-pixel bars in front of a window. Open Image Denoise alone brightens them.
         flat = np.full((64, 64, 3), 0.5, np.float32)
         window = np.where((np.arange(64) % 8 == 3)[None, :, None], 0, 4 * flat)
         self.assertLess(clean(window, flat, flat)[:, 3::8].max(), 0.002)
 
-    def test_guides_are_of_the_references_samples_where_they_are_there(self) -> None:
+    def test_guides_come_from_the_references_samples_if_present(self) -> None:
         import numpy as np
         from dataset import Scene, manifest
         from oidn import prefiltered
@@ -123,12 +124,12 @@ class References(Tools):
         np.testing.assert_array_equal(albedo, scene.rgb("albedo1."))
         scene.channels |= {f"ref.albedo1.{name}": np.full_like(scene.channels["ref.R"], 0.25) for name in "RGB"}
         np.testing.assert_array_equal(guide(scene, "albedo1.", "RGB"), np.full_like(albedo, 0.25))
-        # Noise is less than half, and what is below it still there.
+        # The noise halves, and the albedo below it stays.
         noise = np.random.default_rng(1).normal(0, 0.1, albedo.shape).astype(np.float32)
         after = prefiltered("albedo", (albedo + noise).clip(0, 1)) - albedo
         self.assertLess(np.abs(after).mean(), 0.5 * np.abs(noise).mean())
 
-    def test_a_data_set_is_not_written_over(self) -> None:
+    def test_a_data_set_is_not_overwritten(self) -> None:
         ended = run("references", "--data", SAMPLE, "-o", SAMPLE)
         self.assertEqual((ended.returncode, ended.stderr.count("\n")), (1, 1), ended.stderr)
 

@@ -1,4 +1,4 @@
-"""What `demc.load` says about files it cannot use: `python -m unittest discover -s tests`, in `python/`."""
+"""Tests of `demc.load`: run `python -m unittest discover -s tests` in `python/`."""
 
 import json
 import os
@@ -57,7 +57,7 @@ class Headers(unittest.TestCase):
                 demc.load(self.path)
             parent[keys[-1]] = value
 
-    def test_a_file_from_before_levels_has_the_papers(self) -> None:
+    def test_a_file_without_levels_has_those_of_the_paper(self) -> None:
         del self.meta["model"]["levels"]
         self.write()
         self.assertEqual(demc.load(self.path).model.config.levels, (1, 2, 4, 8, 8))
@@ -71,7 +71,7 @@ class Headers(unittest.TestCase):
         self.assertEqual(model.config, config)
         self.assertEqual(model.latent.conv.weight.shape, (4, 4, 3, 3))
 
-    def test_its_name_tells_levels_that_are_not_the_papers(self) -> None:
+    def test_the_name_contains_levels_that_differ_from_the_paper(self) -> None:
         self.assertEqual(str(demc.ModelConfig(width=3)), "demc, paper reading, width 3")
         name = str(demc.ModelConfig(width=3, levels=(1, 2, 2, 4, 1)))
         self.assertEqual(name, "demc, paper reading, width 3, levels of [3, 6, 6, 12, 3]")

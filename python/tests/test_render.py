@@ -1,6 +1,6 @@
-"""`render/`, the path tracer that makes training data, beside Mitsuba's own integrators.
+"""Tests of `render/` against Mitsuba's own integrators.
 
-Skipped without what it needs (mitsuba, LLVM, OpenEXR), unless DEMC_REQUIRE_MITSUBA=1.
+They are skipped without mitsuba, numpy, or OpenEXR, unless DEMC_REQUIRE_MITSUBA=1.
 """
 
 import importlib.util
@@ -29,7 +29,7 @@ class Render(unittest.TestCase):
         cls.addClassCleanup(sys.path.remove, str(FOLDER))
 
     def scene(self) -> dict:
-        """A box with a light, a wall of plastic and a ball of metal."""
+        """A box with a light, a plastic wall, and a metal ball."""
         from variant import mi
 
         scene = mi.cornell_box()
@@ -51,7 +51,7 @@ class Render(unittest.TestCase):
         a, b = (half.color / half.count for half in halves)
         ours, noise = (a + b) / 2, np.abs(a - b).mean() / 2
         np.testing.assert_allclose(ours.mean((0, 1)), theirs.mean((0, 1)), rtol=0.01)
-        # Two images as noisy as each other differ by sqrt(2) of what one has.
+        # The difference of two equally noisy images has sqrt(2) of the noise of one.
         self.assertLess(np.abs(ours - theirs).mean(), 2 * noise)
 
     def test_features_are_those_of_mitsubas_aov_integrator(self) -> None:
@@ -66,10 +66,10 @@ class Render(unittest.TestCase):
         albedo, normal, position = (ours.features[name] / ours.count for name in ("albedo1", "normal", "position"))
         np.testing.assert_allclose(np.abs(normal).mean((0, 1)), np.abs(theirs[..., 3:6]).mean((0, 1)), atol=0.01)
         np.testing.assert_allclose(position.mean((0, 1)), theirs[..., 6:9].mean((0, 1)), atol=0.01)
-        # Mitsuba's albedo knows no light that is seen and takes plastic and metal whole: the left wall is diffuse.
+        # Mitsuba's albedo differs for visible lights, plastic, and metal; the left wall is diffuse.
         wall = np.s_[8:24, 1:4]
         np.testing.assert_allclose(albedo[wall], theirs[wall][..., :3], atol=0.02)
-        # What is hit second is not what is hit first.
+        # The second hit differs from the first.
         self.assertGreater(np.abs(ours.features["albedo2"] / ours.count - albedo).mean(), 0.05)
 
     def test_a_path_is_traced_once_for_all_channels(self) -> None:
@@ -85,7 +85,7 @@ class Render(unittest.TestCase):
         self.assertGreater(operations[-1], 1000)
         self.assertLess(sum(operations[:-1]), operations[-1] / 2)
 
-    def test_a_clamp_leaves_lights_alone_and_bounds_the_rest(self) -> None:
+    def test_a_clamp_bounds_everything_but_visible_lights(self) -> None:
         import numpy as np
         import tracer
         from variant import mi
@@ -94,7 +94,7 @@ class Render(unittest.TestCase):
         free, bounded = (tracer.render(scene, 16, 1000, clamp) for clamp in (np.inf, 0.1))
         lit = free.features["albedo1"].min(-1) / free.count > 0.999
         self.assertGreaterEqual(lit.sum(), 4)
-        # But for what the light itself reflects.
+        # Except for light that the emitter reflects.
         np.testing.assert_allclose(bounded.color[lit], free.color[lit], rtol=0.03)
         below = np.s_[SIDE // 2 :]
         self.assertLessEqual((bounded.color[below] / free.count).max(), 0.1 + 1e-6)
@@ -118,7 +118,7 @@ class Render(unittest.TestCase):
                 lit += 1
         self.assertGreater(lit, 4)
 
-    def test_black_blinds_are_all_that_becomes_black(self) -> None:
+    def test_only_bars_and_blinds_become_black(self) -> None:
         import numpy as np
         from rooms import Room
 
@@ -185,7 +185,7 @@ class Render(unittest.TestCase):
             if camera["type"] == "thinlens":
                 scene = mi.load_dict(still.scene | {"as it is": camera, "wide": camera | {"aperture_radius": 10 * camera["aperture_radius"]}})
                 masks = (tracer.render(scene, 16, 1, view=view).features["mask"] / 16 for view in range(2))
-                # Pixels on the edge of what is hit.
+                # Pixels that are partly covered.
                 between.append([((0 < mask) & (mask < 1)).sum() for mask in masks])
         self.assertEqual(set(lenses), {"thinlens", "perspective"})
         sharp, wide = np.sum(between, axis=0)
@@ -203,7 +203,7 @@ class Render(unittest.TestCase):
             still.darken(np.random.default_rng(seed))
             scene = mi.load_dict(still.scene | {"camera": still.camera(np.random.default_rng(seed), SIDE)})
             image = tracer.render(scene, 16, 1)
-            # None of a pixel's samples hit anything: not a trace of light.
+            # Pixels whose samples all miss have no light at all.
             missed = image.features["mask"][..., 0] == 0
             self.assertEqual(np.abs(image.color[missed]).sum(), 0)
             self.assertEqual(np.abs(image.features["albedo1"][missed]).sum(), 0)
@@ -212,12 +212,12 @@ class Render(unittest.TestCase):
         self.assertGreater(behind, SIDE**2 / 4)
         self.assertGreater(np.median(lit), 0.05)
 
-    def test_a_data_set_is_the_same_for_one_seed_and_goes_on_where_it_stopped(self) -> None:
+    def test_a_data_set_depends_on_its_seed_and_resumes(self) -> None:
         for kind in ("--rooms", "--stills"):
             with self.subTest(kind):
-                self.goes_on(kind)
+                self.check_resume(kind)
 
-    def goes_on(self, kind: str) -> None:
+    def check_resume(self, kind: str) -> None:
         import numpy as np
         import views
 
@@ -246,7 +246,7 @@ class Render(unittest.TestCase):
         import OpenEXR
 
         with tempfile.TemporaryDirectory() as out:
-            # A seed whose samples' numbers are past 32 bits.
+            # With this seed the sample numbers exceed 32 bits.
             ended = run("-o", out, "--stills", 1, "--views", 2, "--size", 64, "--ref-spp", 64, "--seed", 60)
             self.assertEqual(ended.returncode, 0, ended.stderr)
             files = sorted(Path(out).glob("train/*.exr"))
@@ -260,7 +260,7 @@ class Render(unittest.TestCase):
                     step = lambda plane: np.abs(plane[:, :-2] - 2 * plane[:, 1:-1] + plane[:, 2:]).mean()
                     self.assertLess(step(many), step(few), name)
 
-    def test_nothing_to_render_is_said(self) -> None:
+    def test_nothing_to_render_is_an_error(self) -> None:
         with tempfile.TemporaryDirectory() as empty:
             ended = run("-o", empty)
         self.assertEqual(ended.returncode, 2)

@@ -1,16 +1,18 @@
-"""Other denoisers' images of a data set, for `demc-infer evaluate --baseline NAME=DIR` and `demc-infer report`.
+"""Denoises a data set with other programs, for `--baseline NAME=DIR` of `demc-infer`.
 
     pip install numpy OpenEXR pyoidn scikit-image PyWavelets
     python python/tools/baselines.py oidn --data data/sample -o oidn/
     python python/tools/baselines.py nlm --data data/sample -o nlm/
 
-`oidn` is Intel's Open Image Denoise, given what it asks for: HDR colour, the albedo of the first hit, normals (both noisy,
-so without its `cleanAux`). `oidn-prefilter` has it denoise albedo and normals by themselves first and then believe them, as its
-documentation advises for the best quality. `oidn-color` is the same without features, `oidn-reference` the same of the *references*: their own
-noise taken away, about as near to them as anything can get. `nlm` is non-local means of scikit-image on log(1 + 16 x), which knows of no features; its
-strength is the noise that scikit-image estimates in each image.
+oidn             Intel's Open Image Denoise: HDR colour, noisy albedo (first hit), noisy normal
+oidn-prefilter   the same; albedo and normal are denoised first, as its documentation recommends
+oidn-color       the same without albedo and normal
+oidn-reference   the denoised *references*: about the best possible score
+nlm              non-local means of scikit-image on log(1 + 16 x), without features; its strength is
+                 the noise that scikit-image estimates per image
 
-One EXR file with R, G, B a scene, named as the scene's file. Files that are there are replaced.
+Each output is an EXR file with channels R, G, B, named like the scene's file. Existing files are
+replaced.
 """
 
 import argparse
@@ -23,7 +25,7 @@ from dataset import Scene, as_kind, scenes, write
 from oidn import with_prefilter
 
 LOG_SCALE = 16
-"""What radiance is multiplied by before log(1 + x): noise in the dark and in the light gets about the same size."""
+"""Factor of the radiance before log(1 + x); dark and bright noise then have similar size."""
 
 
 def oidn(image: Scene, color: str = "") -> np.ndarray:
@@ -69,9 +71,9 @@ DENOISERS: dict[str, Callable[[Scene], np.ndarray]] = {
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("denoiser", choices=DENOISERS)
-    parser.add_argument("--data", type=Path, required=True, help="the directory with manifest.json")
+    parser.add_argument("--data", type=Path, required=True, help="directory with manifest.json")
     parser.add_argument("--split", choices=["train", "test"], default="test")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="directory of the images, made if needed")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="directory of the images, created if missing")
     arguments = parser.parse_args()
     try:
         arguments.output.mkdir(parents=True, exist_ok=True)
@@ -79,7 +81,7 @@ def main() -> int:
             clean = DENOISERS[arguments.denoiser](Scene(path))
             bad = int((~np.isfinite(clean)).sum())
             if bad:
-                raise ValueError(f"{path}: {arguments.denoiser} gave {bad} NaN or infinite values")
+                raise ValueError(f"{path}: {arguments.denoiser} produced {bad} NaN or infinite values")
             planes = {name: as_kind(clean[..., i], np.dtype(np.float16)) for i, name in enumerate("RGB")}
             write(arguments.output / f"{path.stem}.exr", planes)
     except (OSError, ValueError, RuntimeError, ImportError) as error:

@@ -1,4 +1,4 @@
-"""A data set's manifest and EXR files, for the tools beside this file."""
+"""Manifest and EXR files of a data set, for the other tools in this folder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import OpenEXR
 
 
 class Scene:
-    """An EXR file's channels and what its header says of the scene."""
+    """The channels of an EXR file, and the scene's entry in its header."""
 
     def __init__(self, path: Path) -> None:
         with OpenEXR.File(str(path), separate_channels=True) as file:
@@ -41,13 +41,13 @@ def scenes(data: Path, split: str) -> list[Path]:
 
 
 def as_kind(plane: np.ndarray, kind: np.dtype) -> np.ndarray:
-    """The plane in a float type, what is too large for it at its limit."""
+    """The plane in another float type; too large values become the largest finite one."""
     limit = np.finfo(kind)
     return np.ascontiguousarray(plane.clip(limit.min, limit.max).astype(kind))
 
 
 def write(path: Path, channels: dict[str, np.ndarray], about: dict[str, str] | None = None) -> None:
-    """An EXR file, whole or not at all."""
+    """Writes an EXR file completely or not at all."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | (about or {})
     unfinished = path.with_name(f".{path.stem}.unfinished.exr")
     OpenEXR.File(header, channels).write(str(unfinished))

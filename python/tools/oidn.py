@@ -1,4 +1,4 @@
-"""Open Image Denoise on features that it has denoised by themselves first, as its documentation advises for the best quality."""
+"""Open Image Denoise with denoised features, which its documentation recommends for quality."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import numpy as np
 
 
 def with_prefilter(color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Linear HDR colour denoised by albedo and normals; all `[H, W, 3]` float32."""
+    """Linear HDR colour, denoised with albedo and normal as guides; all `[H, W, 3]` float32."""
     import pyoidn
 
-    # What is clean may be believed.
+    # clean_aux: the features have no noise.
     return pyoidn.denoise(color, albedo=prefiltered("albedo", albedo), normal=prefiltered("normal", normal), hdr=True, clean_aux=True)
 
 
 def prefiltered(kind: str, feature: np.ndarray) -> np.ndarray:
-    """One feature, `albedo` or `normal`, denoised with nothing else to go by."""
+    """One feature, `albedo` or `normal`, denoised without guides."""
     import pyoidn
 
     out = np.empty_like(feature)

@@ -1,14 +1,20 @@
-"""A data set again, the references that are trained on denoised by Intel's Open Image Denoise.
+"""Writes a copy of a data set whose training references are denoised by Intel's Open Image Denoise.
 
     pip install numpy OpenEXR pyoidn
     python python/tools/references.py --data data/rooms -o data/clean
     demc-train --config configs/renders.toml --set data.root=data/clean
 
-For references of some hundred samples, whose own noise hides structure: Open Image Denoise, at so many samples, leaves more of it than
-`data.reference_filter` does (results/renders). Where it would lighten what the samples say is dark by more than their noise explains, a black
-slat before a window, the samples are believed. Its guides are texture and normals, denoised by themselves first: those of the reference's own samples
-where the file has them (`ref.albedo1.R`, `ref.normal.X`, ...: python/render writes them), else those of the noisy image. All other channels are copied, scenes of the test split are listed where they are, and what is there
-already is kept unless its source is newer. In the manifest `ref_denoised` tells the trainer, whose own filter leaves such references alone.
+Use it for references of some hundred samples per pixel, which have visible noise
+(docs/experiments.md has its effect).
+
+- Its guides are albedo and normal, both denoised first. They come from the reference's own samples
+  if the file has them (`ref.albedo1.R`, `ref.normal.X`, ...; python/render writes them), otherwise
+  from the noisy image.
+- A pixel gets at most as bright as the noise of its samples allows. This keeps black slats in front
+  of a window black.
+- All other channels are copied. Scenes of the test split are listed, not copied.
+- Existing files are kept unless their source is newer.
+- `ref_denoised` in the manifest marks the denoised references.
 """
 
 from __future__ import annotations
@@ -23,18 +29,21 @@ from dataset import Scene, as_kind, manifest, write, write_manifest
 from oidn import with_prefilter
 
 LIGHTER = 3.0
-"""Standard deviations of the noise that a pixel may get lighter by."""
+"""Limit for brightening a pixel, in standard deviations of the noise."""
 LEAST_NOISE, MOST_NOISE = 0.01, 1.0
 LOG_OFFSET = 0.02
-"""Added to radiance before the logarithm: black has one."""
+"""Added to radiance before the logarithm, so that black has a finite one."""
 BLOCK, MARGIN = 16, 8
-"""Noise is measured once for a block of pixels, over it and so many more on each side."""
+"""Noise is measured per block, over the block and a margin on each side. In pixels."""
 MAD = 1.4826
-"""From the median of absolute values to the standard deviation of a normal distribution."""
+"""Standard deviation of a normal distribution with median absolute value 1."""
 
 
 def clean(reference: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """The reference denoised; all `[H, W, 3]` float32, in linear HDR. Negative samples count as 0."""
+    """The denoised reference.
+
+    All arrays are `[H, W, 3]` float32, linear HDR. Negative samples count as 0.
+    """
     samples = reference.clip(0)
     deviation = noise(np.log(samples + LOG_OFFSET).mean(-1))[..., None]
     most = (samples + LOG_OFFSET) * np.exp(LIGHTER * deviation) - LOG_OFFSET
@@ -42,14 +51,17 @@ def clean(reference: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.n
 
 
 def guide(scene: Scene, prefix: str, names: str) -> np.ndarray:
-    """A feature of the reference's own samples where the file has it (python/render writes it), else of the noisy image's."""
+    """A feature of the reference's own samples if the file has it, otherwise of the noisy image."""
     of_reference = f"ref.{prefix}{names[0]}" in scene.channels
     return scene.rgb(f"ref.{prefix}" if of_reference else prefix, names)
 
 
 def noise(plane: np.ndarray) -> np.ndarray:
-    """Standard deviation of the noise around each pixel, `[H, W]`: from how far pixels are from the mean of their four neighbours, by block, as
-    `demc-data`'s `reference_filter` measures it."""
+    """Standard deviation of the noise around each pixel, `[H, W]`.
+
+    It is estimated per block from the differences between pixels and the mean of their four
+    neighbours.
+    """
     padded = np.pad(plane, 1, mode="edge")
     neighbours = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]
     distance = np.abs(plane - neighbours / 4)
@@ -57,13 +69,13 @@ def noise(plane: np.ndarray) -> np.ndarray:
     for top in range(0, plane.shape[0], BLOCK):
         for left in range(0, plane.shape[1], BLOCK):
             rows, columns = (slice(max(0, start - MARGIN), start + BLOCK + MARGIN) for start in (top, left))
-            # A pixel less the mean of four has 5/4 of one pixel's variance.
+            # A pixel minus the mean of four others has 5/4 of one pixel's variance.
             out[top : top + BLOCK, left : left + BLOCK] = MAD * np.median(distance[rows, columns]) / 1.25**0.5
     return out.clip(LEAST_NOISE, MOST_NOISE)
 
 
 def stale(target: Path, source: Path) -> bool:
-    """Whether the target is missing, or not of the source as it is now."""
+    """Whether the target is missing or older than the source."""
     return not target.exists() or target.stat().st_mtime < source.stat().st_mtime
 
 
@@ -71,7 +83,7 @@ def rewrite(source: Path, target: Path) -> None:
     scene = Scene(source)
     cleaned = clean(scene.rgb("ref."), guide(scene, "albedo1.", "RGB"), guide(scene, "normal.", "XYZ"))
     if not np.isfinite(cleaned).all():
-        raise ValueError(f"{source}: the denoised reference has NaN or infinite values")
+        raise ValueError(f"{source}: the denoised reference contains NaN or infinite values")
     for i, name in enumerate("RGB"):
         scene.channels["ref." + name] = as_kind(cleaned[..., i], scene.channels["ref." + name].dtype)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -80,13 +92,13 @@ def rewrite(source: Path, target: Path) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="the directory with manifest.json")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="directory of the new data set, made if needed")
+    parser.add_argument("--data", type=Path, required=True, help="directory with manifest.json")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="directory of the new data set, created if missing")
     arguments = parser.parse_args()
     data, output = arguments.data, arguments.output
     try:
         if output.resolve() == data.resolve():
-            raise ValueError(f"{output} is the data set itself")
+            raise ValueError(f"{output}: expected another directory than --data")
         listed = manifest(data)
         output.mkdir(parents=True, exist_ok=True)
         denoised = 0

@@ -1,8 +1,8 @@
-"""Makes `expected.json` with other people's code: `python tests/metrics/make_expected.py`.
+"""Makes `expected.json` with independent implementations: `python tests/metrics/make_expected.py`.
 
-Needs numpy, OpenEXR, scikit-image, flip-evaluator (NVIDIA's own) from PyPI. The candidates are the sample's noisy test
-images, and the references moved by a pixel and brightened, which is an error of another kind. RelMSE and its relatives are
-written down from the papers' formulas in float64; SSIM is scikit-image's, FLIP is NVIDIA's.
+Needs numpy, OpenEXR, scikit-image and NVIDIA's flip-evaluator from PyPI. The candidates are the sample's noisy test
+images, and the references shifted by a pixel and brightened. RelMSE and similar metrics follow the papers' formulas in
+float64. SSIM comes from scikit-image, FLIP from NVIDIA.
 """
 
 import json

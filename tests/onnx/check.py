@@ -1,5 +1,8 @@
-"""Whether ONNX files are what they claim, and what they compute: `FOLDER`, which holds `NAME.onnx`, `sizes.json` with a
-`[batch, height, width]` a case, and `CASE.color` and `CASE.features`, raw float32. Writes `NAME.CASE.output`."""
+"""Checks the structure of ONNX files and runs them: `FOLDER`.
+
+FOLDER holds `NAME.onnx`, `sizes.json` with one `[batch, height, width]` per case, and `CASE.color` and `CASE.features` as
+raw float32. The script writes `NAME.CASE.output`.
+"""
 
 import json
 import sys
@@ -33,7 +36,7 @@ def check_structure(path: Path) -> None:
     assert len(json.loads(meta["demc.features"])) == 12
     assert bundle["layout"]["color"] == ["R", "G", "B"] and bundle["step"] == model.model_version
 
-    # With sizes filled in, inference must find every shape, and the output's must follow.
+    # With fixed input sizes, shape inference must determine every shape, including the output.
     sizes = {"color": [2, 3, 96, 160], "features": [2, 12, 96, 160]}
     fixed = update_inputs_outputs_dims(model, sizes, {"output": ["b", 3, "h", "w"]})
     inferred = onnx.shape_inference.infer_shapes(fixed, check_type=True, strict_mode=True, data_prop=True)
@@ -57,7 +60,7 @@ def main() -> None:
             output = session.run(["output"], inputs)[0]
             assert output.dtype == numpy.float32 and output.shape == (batch, 3, height, width)
             output.tofile(folder / f"{path.stem}.{case}.output")
-        onnxruntime.set_default_logger_severity(4)  # the refusal below is meant
+        onnxruntime.set_default_logger_severity(4)  # the errors below are expected
         for height, width in [(32, 48), (33, 32), (64, 16)]:
             inputs = {name: numpy.ones((1, s[1], height, width), "f4") for name, s in SHAPES.items()}
             try:

@@ -1,7 +1,7 @@
-"""Makes the parity fixtures from the PyTorch twin (`pip install ./python`): `python tests/parity/make_fixtures.py`.
+"""Makes the parity fixtures with the PyTorch package (`pip install ./python`): `python tests/parity/make_fixtures.py`.
 
-Everything is computed in float64 and stored as float32, so that a fixture is the truth to the last bit of a float32 and
-does not depend on the machine; whatever a test measures is the error of the Rust side. Names of tensors are PyTorch's.
+Everything is computed in float64 and stored as float32. So a fixture is exact to the last bit of a float32, does not
+depend on the machine, and tests measure the error of the Rust side. Tensors have PyTorch's names.
 
 - `inputs.safetensors`: one batch, `color_gamma`, `features_z`, `reference_hdr`.
 - `VARIANT-READING.safetensors`: `weight/*`, `output_eval` and, in train mode, `output_train`, `loss`, `grad/*`, and
@@ -9,9 +9,9 @@ does not depend on the machine; whatever a test measures is the error of the Rus
 - `blocks.safetensors`: inputs, outputs and gradients of single blocks of `demc-*`, for the loss
   `sum(outputs * probes)`; and the loss function on its own.
 
-What makes a gradient test worth something, and what makes one fail for nothing: outputs of order 1, no gradient that
-vanishes but those that must, and no ReLU so close to its kink that rounding decides. The script checks all of it, the
-last by a float32 run of PyTorch, which must stay within a fifth of the tolerances of the Rust tests.
+A gradient test is meaningful and robust if three conditions hold. Outputs have order 1. No gradient vanishes, except
+where it must. No ReLU is so close to its kink that rounding decides. The script checks all three; for the last one, a
+float32 run of PyTorch must stay within a fifth of the tolerances of the Rust tests.
 """
 
 from pathlib import Path
@@ -26,8 +26,8 @@ from demc.network import READINGS, VARIANTS
 
 FIXTURES = Path(__file__).parent / "fixtures"
 WIDTH = 2
-SHAPE = (2, 64, 64)  # batch, height, width: the latent is 2 x 2, the least where each tap of its 3x3 kernels counts
-SEED = 0  # found by trial: the checks say no to some
+SHAPE = (2, 64, 64)  # batch, height, width: the latent is 2 x 2, the smallest size that uses every tap of its 3x3 kernels
+SEED = 0  # found by trial, because the checks reject some seeds
 STEPS, LEARNING_RATE = 5, 1e-3
 MARGIN = 0.2  # share of the Rust tests' tolerances that float32 rounding may use up
 OUTPUT_TOLERANCE = 1e-5  # of the largest value; these three are those of tests/tests/parity/
@@ -61,12 +61,12 @@ def write(name: str, tensors: dict[str, Tensor]) -> None:
 
 
 def tensor(values: np.ndarray) -> Tensor:
-    """Values as float64, but exactly those that the file will hold."""
+    """Values as float64, rounded to the float32 values of the file."""
     return torch.from_numpy(np.float32(values)).double()
 
 
 def draw_batch(random: np.random.RandomState) -> dict[str, Tensor]:
-    """RandomState, because NumPy has frozen its stream for good."""
+    """Random inputs and reference; NumPy guarantees that RandomState never changes."""
     b, h, w = SHAPE
     return {
         "color_gamma": tensor(random.uniform(0, 1.5, (b, 3, h, w))),
@@ -76,8 +76,8 @@ def draw_batch(random: np.random.RandomState) -> dict[str, Tensor]:
 
 
 def draw_weights(config: ModelConfig, batch: dict[str, Tensor], random: np.random.RandomState) -> dict[str, Tensor]:
-    """Random weights, then one pass that shifts and scales each convolution so that every channel of its output has a
-    mean near 0.75 and a deviation of 0.7: at a width of 2, plain random weights leave half of the network dead."""
+    """Random weights, calibrated by one pass. It shifts and scales each convolution so that every channel of its output
+    has a mean near 0.75 and a standard deviation of 0.7. Without it, half of a network of width 2 would be dead."""
     model = Denoiser(config).double().eval()
     ranges = {"running_mean": (0.4, 1.0), "running_var": (0.3, 0.8), "weight": (0.5, 0.9), "bias": (0.6, 0.9)}
     for name, value in model.state_dict().items():
@@ -101,7 +101,7 @@ def draw_weights(config: ModelConfig, batch: dict[str, Tensor], random: np.rando
 
 
 def zero_by_construction(config: ModelConfig, name: str) -> bool:
-    """A bias before a batch normalisation: the normalisation takes the mean away again."""
+    """Whether this is a bias before a batch normalisation, which cancels the bias with the mean."""
     normed = ("deconv.bias", "latent.conv.bias") if READINGS[config.reading].norm else ()
     return name.endswith(("fusion.blocks.1.conv.bias", "fusion.blocks.2.conv.bias", *normed))
 
@@ -109,7 +109,7 @@ def zero_by_construction(config: ModelConfig, name: str) -> bool:
 def run(
     config: ModelConfig, weights: dict[str, Tensor], batch: dict[str, Tensor], dtype: torch.dtype
 ) -> dict[str, Tensor]:
-    """What a fixture holds but the weights: both outputs, the loss, gradients, and Adam's result."""
+    """The contents of a fixture besides the weights: both outputs, the loss, gradients, and the result of Adam."""
     model = Denoiser(config)
     model.load_state_dict(weights, strict=True)
     model.to(dtype)
@@ -131,7 +131,7 @@ def run(
 
 
 def check_alive(config: ModelConfig, results: dict[str, Tensor]) -> None:
-    """Fails where outputs are far from order 1 or a gradient that should not be zero nearly is."""
+    """Fails if outputs are far from order 1, or if a gradient nearly vanishes that should not."""
     for name, value in results.items():
         zeros, largest = (value == 0).double().mean(), value.abs().max()
         if name.startswith("output"):
@@ -145,11 +145,11 @@ def check_alive(config: ModelConfig, results: dict[str, Tensor]) -> None:
 
 
 def check_robust(config: ModelConfig, results: dict[str, Tensor], single: dict[str, Tensor]) -> float:
-    """The largest share of a tolerance that float32 rounding takes; fails where it is more than MARGIN."""
+    """The largest share of a tolerance that float32 rounding takes; fails if it exceeds MARGIN."""
     shares = {}
     for name, expected in results.items():
         if zero_by_construction(config, name) or name.endswith("running_mean"):
-            continue  # Adam walks such a bias at random, and the running mean after it follows
+            continue  # Adam moves such a bias at random, and the running mean follows
         scale = expected.abs()
         if name.startswith("grad/"):
             tolerance = GRADIENT_TOLERANCE[0] * scale.max() + GRADIENT_TOLERANCE[1] * scale
@@ -165,7 +165,7 @@ def check_robust(config: ModelConfig, results: dict[str, Tensor], single: dict[s
 
 
 def blocks_of(config: ModelConfig, weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The blocks of a network by their paths, on inputs of their own."""
+    """The blocks of a network by their paths, each with its own inputs."""
     random = np.random.RandomState(1)
     k = WIDTH
 

@@ -1,1 +1,1 @@
-//! Trips across the crates: parity with PyTorch, backends, the README's commands. See `tests/tests/`.
+//! Tests across the crates, in `tests/tests/`: parity with PyTorch, backends, metrics and exports.

@@ -1,4 +1,5 @@
-//! Every metric against another implementation, on the sample's renders: `metrics/make_expected.py` says whose.
+//! Compares every metric with another implementation on the sample's renders;
+//! `metrics/make_expected.py` names the implementations.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -6,9 +7,9 @@ use std::path::Path;
 use demc_data::{ChannelLayout, read_frame};
 use demc_model::metrics::{Image, METRICS};
 
-/// Difference allowed, by the expected value. Formulas in float64 agree to rounding, but the headline's epsilon is the loss's
-/// float32 0.001 (relative error 5e-8) and the gamma the float32 2.2 (2e-8); FLIP is single precision on both sides, with
-/// sums in another order.
+/// Relative tolerance. Formulas in float64 agree to rounding. RelMSE uses the float32 epsilon 0.001
+/// of the loss (relative error 5e-8), and the gamma is the float32 2.2 (2e-8). FLIP is single
+/// precision on both sides, with a different order of sums.
 fn tolerance(metric: &str) -> f64 {
     match metric {
         "flip" => 1e-4,
@@ -43,7 +44,7 @@ fn metrics_agree_with_other_implementations() {
             };
             assert_eq!(expected.len(), METRICS.len(), "all metrics");
             for metric in METRICS {
-                let (found, wanted) = ((metric.of)(&c, &r), expected[metric.name]);
+                let (found, wanted) = ((metric.measure)(&c, &r), expected[metric.name]);
                 let found = found.expect("a value");
                 assert!(
                     (found - wanted).abs() <= tolerance(metric.name) * wanted.abs(),

@@ -1,8 +1,8 @@
-//! Exported ONNX graphs in the ONNX Runtime of this machine: every network, f32 and f16, at sizes that nothing in a file
-//! names, against this program's own images.
+//! Runs exported ONNX graphs in an installed ONNX Runtime and compares the images with this
+//! program's: every network, f32 and f16, at sizes that no file states.
 //!
-//! Needs a Python (`DEMC_PYTHON`, default `python3`) with `pip install numpy onnx onnxruntime`. Without one the test says that
-//! it was skipped; with `DEMC_REQUIRE_ONNX=1` it fails.
+//! Needs a Python (`DEMC_PYTHON`, default `python3`) with `pip install numpy onnx onnxruntime`.
+//! Without it, the test reports that it is skipped; with `DEMC_REQUIRE_ONNX=1` it fails.
 
 mod live;
 #[path = "parity/tensors.rs"]
@@ -32,19 +32,20 @@ const SIZES: [[usize; 3]; 6] = [
     [3, 32, 160],
 ];
 
-/// Radiance of an image's largest value, about.
+/// Approximate radiance of an image's largest value.
 const LARGEST: f32 = 2.0;
 
 const PRECISIONS: [(Precision, &str); 2] = [(Precision::F32, "f32"), (Precision::F16, "f16")];
 
-/// What the project promises against the largest value of the batch.
+/// The guaranteed deviation relative to the largest value of the batch.
 const OF_LARGEST: Tolerance = Tolerance {
     absolute: 0.0,
     of_largest: 1e-4,
     of_value: 0.0,
 };
 
-/// And of each value, down to the 0.03 below which RelMSE (Eq. 5, epsilon 0.001) no longer looks at shares of it.
+/// The deviation relative to each value, down to 0.03; below, RelMSE (Eq. 5, epsilon 0.001) is no
+/// longer relative.
 const OF_VALUE: Tolerance = Tolerance {
     absolute: 1e-4 * 0.031_622_8,
     of_largest: 0.0,
@@ -58,7 +59,7 @@ fn onnx_runtime_computes_what_this_program_does() {
     let Some(python) = Python::with(packages, install, "DEMC_REQUIRE_ONNX") else {
         return;
     };
-    // Fresh weights and inputs at each run; the seed stands in every failure.
+    // New weights and inputs in each run; every failure names the seed.
     let seed: u64 = rand::random();
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let folder = TempDir::new().expect("a temporary directory");
@@ -103,16 +104,16 @@ fn onnx_runtime_computes_what_this_program_does() {
 
     for (name, bundle) in &bundles {
         let mut worst = [0.0f32; 2];
-        let (mut lit, mut of) = (0, 0);
+        let (mut lit, mut total) = (0, 0);
         for (case, frames) in frames.iter().enumerate() {
             let what = format!("{name}, {:?}, seed {seed}", SIZES[case]);
             let expected: Vec<f32> = frames
                 .iter()
                 .flat_map(|frame| bundle.denoise(frame).expect("denoised"))
                 .collect();
-            // Of all sizes together: a small image may be dark where the one that `scaled` looked at is not.
+            // Over all sizes: a small image may be dark although the image in `scaled` is not.
             lit += expected.iter().filter(|&&v| v > 1e-3).count();
-            of += expected.len();
+            total += expected.len();
             let found = read_floats(&folder.join(format!("{name}.{case}.output")));
             for (worst, tolerance) in worst.iter_mut().zip([OF_LARGEST, OF_VALUE]) {
                 let share = assert_close(&what, &found, &expected, tolerance);
@@ -120,16 +121,16 @@ fn onnx_runtime_computes_what_this_program_does() {
             }
         }
         assert!(
-            lit > of / 2,
-            "{name}, seed {seed}: only {lit} of {of} are lit"
+            lit > total / 2,
+            "{name}, seed {seed}: only {lit} of {total} values are lit"
         );
         let [of_largest, of_value] = worst;
         println!("{name}: {of_largest:.1e} of the largest value, {of_value:.1e} of each");
     }
 }
 
-/// The same with an output convolution that only adds, and makes the largest value of an image [`LARGEST`]: a random network's
-/// outputs are of any order, and black wherever it subtracts.
+/// The network with a positive output convolution, scaled to a largest value of [`LARGEST`]. The
+/// output of a random network has any magnitude, and is black where the convolution is negative.
 fn scaled(bundle: &Bundle, rng: &mut ChaCha8Rng) -> Bundle {
     let frame = &frames([1, 96, 96], bundle, rng)[0];
     let with_head = |change: &dyn Fn(f32) -> f32| {
@@ -166,7 +167,7 @@ fn frames([batch, height, width]: [usize; 3], bundle: &Bundle, rng: &mut ChaCha8
             name: "random".into(),
             width,
             height,
-            // What is below 0 stays: the graph clamps, as the program does.
+            // Values below 0 stay, because graph and program clamp them.
             color: color.map(|x| x * x * x).collect(),
             features,
             reference: None,

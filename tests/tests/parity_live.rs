@@ -1,7 +1,9 @@
-//! Parity with the PyTorch of this machine: weights drawn here, exported, loaded by `python/` with `strict=True`, run.
+//! Parity with an installed PyTorch: random weights are exported, loaded by `python/` with
+//! `strict=True`, and run.
 //!
-//! Needs a Python with the package of `python/` (`pip install ./python`), named by `DEMC_PYTHON` (default `python3`).
-//! Without one the test says that it was skipped; with `DEMC_REQUIRE_TORCH=1` it fails.
+//! Needs a Python with the package of `python/` (`pip install ./python`), named by `DEMC_PYTHON`
+//! (default `python3`). Without it, the test reports that it is skipped; with
+//! `DEMC_REQUIRE_TORCH=1` it fails.
 
 mod live;
 #[path = "parity/tensors.rs"]
@@ -20,10 +22,10 @@ use safetensors::tensor::{Dtype, TensorView};
 use tempfile::TempDir;
 use tensors::{Tolerance, assert_close, read};
 
-/// Not square and of two images; nothing in a file says it.
+/// Two images that are not square; files do not state the size.
 const SHAPE: [usize; 4] = [2, 3, 64, 96];
 
-/// What the project promises, against the output's largest value; measured: 1e-6.
+/// The guaranteed deviation relative to the largest value of the output; measured: 1e-6.
 const OUTPUT: Tolerance = Tolerance {
     absolute: 0.0,
     of_largest: 1e-4,
@@ -57,7 +59,7 @@ fn pytorch_loads_every_export_strictly_and_agrees() {
 }
 
 fn agrees(python: &Python, variant: Variant, reading: Reading, names: Names, precision: Precision) {
-    // Fresh weights and inputs at each run; the seed stands in every failure.
+    // New weights and inputs in each run; every failure names the seed.
     let seed: u64 = rand::random();
     let what = format!(
         "{}, {} reading, {names:?} names, {precision:?}, seed {seed}",
@@ -86,7 +88,7 @@ fn agrees(python: &Python, variant: Variant, reading: Reading, names: Names, pre
         String::from_utf8_lossy(&run.stderr)
     );
 
-    // Rounding to f16 has been done once, in the file, for both sides.
+    // The file is already rounded to f16, for both sides.
     let device = Device::flex();
     let model = Bundle::load(&bundle, &device)
         .expect("the bundle loads")

@@ -1,8 +1,9 @@
-//! What users do in Python with what `demc-infer` writes: `export --verify`, weights that were trained further and come back, and
-//! the programs in `python/examples`.
+//! Use of exported files in Python: `export --verify`, weights trained in PyTorch and imported
+//! again, and the programs in `python/examples`.
 //!
-//! Needs a Python (`DEMC_PYTHON`, default `python3`) with `pip install numpy onnxruntime OpenEXR ./python`. Tests without one say
-//! that they were skipped; with `DEMC_REQUIRE_ONNX=1` or `DEMC_REQUIRE_TORCH=1` they fail.
+//! Needs a Python (`DEMC_PYTHON`, default `python3`) with `pip install numpy onnxruntime OpenEXR
+//! ./python`. Without it, the tests report that they are skipped; with `DEMC_REQUIRE_ONNX=1` or
+//! `DEMC_REQUIRE_TORCH=1` they fail.
 
 mod live;
 #[allow(dead_code, reason = "each test uses its part")]
@@ -25,9 +26,9 @@ use rand_chacha::ChaCha8Rng;
 use tempfile::TempDir;
 use tensors::{Tolerance, assert_close};
 
-/// How far random networks are moved from where they start.
+/// Random change of the initial weights.
 const MOVE_BY: Range<f32> = -0.05..0.06;
-/// What the project promises, against the output's largest value.
+/// The guaranteed deviation relative to the largest value of the output.
 const TOLERANCE: Tolerance = Tolerance {
     absolute: 0.0,
     of_largest: 1e-4,
@@ -48,18 +49,18 @@ fn repository() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// The model that `demc-infer` comes with.
-fn shipped() -> Bundle {
+/// The bundled model.
+fn bundled_model() -> Bundle {
     let path = repository().join("models/demc.safetensors");
     Bundle::load(&path, &Device::flex()).expect("the model loads")
 }
 
 #[test]
-fn verify_passes_what_onnx_runtime_computes_and_no_other_model() {
+fn verify_accepts_onnx_runtime_and_rejects_another_model() {
     let Some(python) = onnx() else { return };
     let folder = TempDir::new().expect("a temporary directory");
     let path = folder.path().join("x.onnx");
-    let bundle = shipped();
+    let bundle = bundled_model();
     for precision in [Precision::F32, Precision::F16] {
         bundle.export_onnx(&path, precision).expect("exported");
         let expected = bundle.rounded(precision).expect("rounded");
@@ -71,7 +72,7 @@ fn verify_passes_what_onnx_runtime_computes_and_no_other_model() {
         );
         assert!(found.deviations.iter().all(|d| d.passes()), "{found:?}");
     }
-    // A statistic that is off by a hundredth of a deviation is seen.
+    // An error of a hundredth of a standard deviation in one statistic is detected.
     let mut other = bundle;
     other.meta.normalizer.features.mean[3] += 0.01 * other.meta.normalizer.features.std[3];
     let found = verify(&path, Runtime::OnnxRuntime, python.path(), &other).expect("run");
@@ -79,7 +80,7 @@ fn verify_passes_what_onnx_runtime_computes_and_no_other_model() {
 }
 
 #[test]
-fn verify_passes_what_pytorch_computes_with_either_style_of_names() {
+fn verify_accepts_pytorch_with_either_style_of_names() {
     let Some(python) = torch() else { return };
     let folder = TempDir::new().expect("a temporary directory");
     let path = folder.path().join("x.safetensors");
@@ -95,7 +96,7 @@ fn verify_passes_what_pytorch_computes_with_either_style_of_names() {
 }
 
 #[test]
-fn weights_trained_in_pytorch_come_back() {
+fn weights_trained_in_pytorch_are_imported() {
     let Some(python) = torch() else { return };
     const SIDE: usize = 64;
     let mut rng = ChaCha8Rng::seed_from_u64(6);
@@ -149,7 +150,7 @@ fn weights_trained_in_pytorch_come_back() {
     }
 }
 
-/// The program `script` of `python/examples` with the file `model`, against this one, on an image of the sample.
+/// Compares `script` of `python/examples` on the file `model` with this program, on a sample image.
 fn example(python: &Python, script: &str, model: &Path, bundle: &Bundle) {
     let source = repository().join("data/sample/test/gen-table-test-1.exr");
     let target = model.with_file_name("out.exr");
@@ -173,7 +174,7 @@ fn the_onnx_example_denoises_the_sample() {
     let Some(python) = onnx() else { return };
     let folder = TempDir::new().expect("a temporary directory");
     let model = folder.path().join("demc.onnx");
-    let bundle = shipped();
+    let bundle = bundled_model();
     bundle
         .export_onnx(&model, Precision::F16)
         .expect("exported");
@@ -186,7 +187,7 @@ fn the_torch_example_denoises_the_sample() {
     let Some(python) = torch() else { return };
     let folder = TempDir::new().expect("a temporary directory");
     let model = folder.path().join("demc.safetensors");
-    let bundle = shipped();
+    let bundle = bundled_model();
     bundle
         .export(&model, Names::Torch, Precision::F32)
         .expect("exported");

@@ -1,6 +1,6 @@
-"""Trains a bundle one step and saves its weights as PyTorch users do: `BUNDLE COLOR FEATURES SIDE WEIGHTS OUTPUT`.
+"""Trains a bundle for one step and saves its weights with PyTorch: `BUNDLE COLOR FEATURES SIDE WEIGHTS OUTPUT`.
 
-COLOR, FEATURES and OUTPUT are raw float32 of a square image; OUTPUT is what the trained network makes of it.
+COLOR, FEATURES and OUTPUT are raw float32 of a square image; OUTPUT is the result of the trained network.
 """
 
 import sys

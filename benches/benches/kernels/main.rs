@@ -1,15 +1,19 @@
-//! Every kernel of `demc-kernels` at the sizes of a training step (batch 4 of 128 x 128): GFLOP/s and its share of the
-//! machine's own matrix product, GB/s and its share of a copy, each pair measured in turns.
+//! Speed of every kernel of `demc-kernels` at the sizes of a training step (batch 4 of 128 x 128).
+//!
+//! The bench reports GFLOP/s relative to a matrix product, or GB/s relative to a copy, each pair
+//! measured in turns.
 //!
 //! ```sh
 //! cargo bench -p demc-bench --bench kernels              # base width 32, all kernels
 //! cargo bench -p demc-bench --bench kernels -- 64 conv3x3
 //! ```
 //!
-//! A number is the base width, another word a part of the kernels' names, `rounds=N` the rounds. `DEMC_ISA` chooses the
-//! instructions, `RAYON_NUM_THREADS` the threads. The matrix product is the `gemm` crate's, 1024^3 or what is faster, through
-//! Burn, the copy one of 64 MiB by all threads. A convolution that saves multiplications (Winograd) counts as if it made
-//! all of them, so its share can be above 100 %.
+//! Arguments: a number is the base width, another word a part of kernel names, `rounds=N` the
+//! number of rounds. `DEMC_ISA` selects the instructions, `RAYON_NUM_THREADS` the threads.
+//!
+//! The matrix product is that of the `gemm` crate through Burn, at the fastest of three sizes. The
+//! copy moves 64 MiB on all threads. Winograd convolutions count the multiplications of the plain
+//! sum, so their share can exceed 100 %.
 
 mod peak;
 
@@ -19,7 +23,7 @@ use peak::Peak;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// That of the binaries.
+/// The allocator of the binaries.
 #[global_allocator]
 static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
 
@@ -59,7 +63,7 @@ fn main() {
     bench.layouts();
 }
 
-/// What the command line says.
+/// The command line options.
 struct Options {
     width: usize,
     rounds: usize,
@@ -85,12 +89,12 @@ impl Options {
     }
 }
 
-/// What a kernel's time is held against.
+/// The work of a kernel, which determines its rate.
 #[derive(Clone, Copy)]
 enum Work {
-    /// Floating point operations, a multiplication and an addition being two.
+    /// Floating point operations; a multiplication and an addition count as two.
     Flops(f64),
-    /// Bytes that must be read and written.
+    /// Bytes read and written.
     Bytes(f64),
 }
 
@@ -130,7 +134,7 @@ impl Bench {
         );
     }
 
-    /// The 3x3 convolutions of every level, those at the edges of the network, and the fusion's.
+    /// The 3x3 convolutions of every level, of the first and last layers, and of the fusion.
     fn convolutions(&mut self) {
         let c = self.options.width;
         let mut sizes = vec![(3, c, 1), (12, c, 1), (c, 3, 1)];
@@ -248,7 +252,7 @@ impl Bench {
         let values = grid_at(1).pixels() * c;
         let (x, gamma, beta) = (draw(values), draw(c), draw(c));
         let (mut y, mut mean, mut variance) = (draw(values), draw(c), draw(c));
-        // The map is read once for the statistics and once to apply them.
+        // The map is read once for the statistics and once for normalisation.
         self.run(
             &format!("batch norm forward {c} at full size"),
             bytes(3 * values),
@@ -300,7 +304,7 @@ impl Bench {
     }
 
     fn adam(&mut self) {
-        // About as many as the whole network: 42.9 million at width 64.
+        // About the size of the whole network: 42.9 million at width 64.
         let values = 10_463 * self.options.width.pow(2);
         let rule = adam::Adam {
             lr: 1e-4,
@@ -335,7 +339,7 @@ impl Bench {
     }
 }
 
-/// The batch's grid, `down` times smaller than a patch.
+/// The grid of the batch, `down` times smaller than a patch.
 fn grid_at(down: usize) -> Grid {
     Grid {
         batch: BATCH,

@@ -1,10 +1,10 @@
-//! What the machine can do: its best matrix product and copy.
+//! Peak performance of the machine: its fastest matrix product and copy.
 
 use burn::tensor::{Device, Distribution, Tensor};
 use demc_bench::stopwatch::turn;
 use rayon::prelude::*;
 
-/// What the machine can do, and the means to ask it again.
+/// Peak performance, and the operands target measure it again.
 pub struct Peak {
     pub side: usize,
     pub flops: f64,
@@ -12,7 +12,7 @@ pub struct Peak {
     a: Tensor<2>,
     b: Tensor<2>,
     from: Vec<f32>,
-    to: Vec<f32>,
+    target: Vec<f32>,
 }
 
 impl Peak {
@@ -32,7 +32,7 @@ impl Peak {
             .map(rate)
             .into_iter()
             .fold((0.0, 0), |a, b| if a.0 > b.0 { a } else { b });
-        let (from, to) = (vec![1.0; 1 << 24], vec![0.0; 1 << 24]);
+        let (from, target) = (vec![1.0; 1 << 24], vec![0.0; 1 << 24]);
         let mut peak = Peak {
             side,
             flops,
@@ -40,7 +40,7 @@ impl Peak {
             a: square(side),
             b: square(side),
             from,
-            to,
+            target,
         };
         peak.copy();
         let seconds = (0..5)
@@ -61,10 +61,10 @@ impl Peak {
 
     pub fn copy(&mut self) {
         let chunk = 1 << 16;
-        self.to
+        self.target
             .par_chunks_mut(chunk)
             .zip(self.from.par_chunks(chunk))
-            .for_each(|(to, from)| to.copy_from_slice(from));
+            .for_each(|(target, from)| target.copy_from_slice(from));
     }
 
     /// Bytes that [`Self::copy`] reads and writes.

@@ -5,40 +5,40 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Result;
-use demc_data::channel::{Channel, Kind};
+use demc_data::channel::{Channel, ChannelType};
 use demc_data::exr::ExrFile;
 use demc_data::plane::Plane;
 use serde::Serialize;
 
-/// What one channel holds.
+/// Properties of one channel.
 #[derive(Serialize)]
-struct Row {
+struct ChannelRow {
     name: String,
     layer: Option<String>,
     #[serde(rename = "type")]
-    kind: Kind,
+    kind: ChannelType,
     size: String,
-    /// Of the finite samples; none if there are none.
-    range: Option<Range>,
+    /// Range of the finite samples; none if there are none.
+    range: Option<SampleRange>,
     non_finite: usize,
 }
 
 #[derive(Serialize)]
-struct Range {
+struct SampleRange {
     min: f32,
     max: f32,
     mean: f64,
 }
 
-/// One file.
+/// All channels of one file.
 #[derive(Serialize)]
-struct Report<'a> {
+struct FileReport<'a> {
     file: &'a Path,
-    channels: Vec<Row>,
+    channels: Vec<ChannelRow>,
 }
 
-/// Prints a table for each file, or one JSON array of all. A file that cannot be used is an error line on
-/// standard error and a failure at the end: the others are inspected all the same.
+/// Prints a table per file, or one JSON array. A file that cannot be read gives one error line and,
+/// at the end, a failure status; the other files are still inspected.
 pub fn run(files: &[PathBuf], json: bool) -> Result<ExitCode> {
     let mut reports = Vec::new();
     let mut status = ExitCode::SUCCESS;
@@ -51,7 +51,7 @@ pub fn run(files: &[PathBuf], json: bool) -> Result<ExitCode> {
                 continue;
             }
         };
-        let report = Report { file, channels };
+        let report = FileReport { file, channels };
         if json {
             reports.push(report);
         } else {
@@ -64,7 +64,7 @@ pub fn run(files: &[PathBuf], json: bool) -> Result<ExitCode> {
     Ok(status)
 }
 
-fn rows(path: &Path) -> Result<Vec<Row>> {
+fn rows(path: &Path) -> Result<Vec<ChannelRow>> {
     let mut file = ExrFile::open(path)?;
     let channels = file.channels().to_vec();
     let names: Vec<&str> = channels
@@ -79,16 +79,16 @@ fn rows(path: &Path) -> Result<Vec<Row>> {
         .collect())
 }
 
-fn row(channel: &Channel, plane: &Plane) -> Row {
+fn row(channel: &Channel, plane: &Plane) -> ChannelRow {
     let samples = plane.to_f32();
     let finite = samples.iter().copied().filter(|sample| sample.is_finite());
     let count = finite.clone().count();
-    let range = (count > 0).then(|| Range {
+    let range = (count > 0).then(|| SampleRange {
         min: finite.clone().fold(f32::INFINITY, f32::min),
         max: finite.clone().fold(f32::NEG_INFINITY, f32::max),
         mean: finite.map(f64::from).sum::<f64>() / count as f64,
     });
-    Row {
+    ChannelRow {
         name: channel.name.clone(),
         layer: channel.layer.clone(),
         kind: channel.kind,
@@ -98,9 +98,9 @@ fn row(channel: &Channel, plane: &Plane) -> Row {
     }
 }
 
-fn table(report: &Report<'_>) -> String {
+fn table(report: &FileReport<'_>) -> String {
     let rows = &report.channels;
-    let longest = |text: fn(&Row) -> &str, title: &str| {
+    let longest = |text: fn(&ChannelRow) -> &str, title: &str| {
         rows.iter()
             .map(|row| text(row).chars().count())
             .chain([title.len()])

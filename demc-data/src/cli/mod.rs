@@ -1,4 +1,4 @@
-//! The command line: arguments, and what is done with them.
+//! The command line: arguments and dispatch.
 
 mod inspect;
 mod stats;
@@ -11,37 +11,37 @@ use anyhow::{Context, Result};
 use clap::{Args, Parser, Subcommand};
 use demc_data::Split;
 
-/// Looks into the images and data sets that a DEMC denoiser is trained on.
+/// Inspects images and data sets for training a DEMC denoiser.
 ///
-/// Exit status: 0 done, 1 a file or data set cannot be used, 2 wrong arguments.
+/// Exit status: 0 success, 1 a file or data set cannot be used, 2 wrong arguments.
 #[derive(Parser)]
 #[command(version, max_term_width = 100)]
 pub struct Cli {
     #[command(subcommand)]
-    command: Command,
+    command: DataCommand,
 }
 
 #[derive(Subcommand)]
-enum Command {
-    /// Show what is in OpenEXR files: size, channels, and each channel's type and range.
+enum DataCommand {
+    /// Show the contents of OpenEXR files: size, channels, and each channel's type and range.
     ///
-    /// Channel names are printed as a channel layout has to spell them: `Layer.channel` in a file of
-    /// several parts. Minimum, maximum and mean leave out NaN and infinite samples, which the last column
-    /// counts: training and denoising refuse a file that has any. A file that cannot be read is reported, the
-    /// others are shown, and the exit status is 1.
-    Inspect(Inspect),
+    /// Channel names appear as a channel layout must spell them: `Layer.channel` in a file of
+    /// several parts. Minimum, maximum and mean exclude NaN and infinite samples; the last column
+    /// counts these. Training and denoising refuse a file that has any. A file that cannot be read
+    /// is reported; the other files are shown, and the exit status is 1.
+    Inspect(InspectArguments),
     /// Measure a data set: scenes, sizes, patches, and each feature's mean and standard deviation.
     ///
-    /// The numbers are those that training subtracts and divides by: over every pixel of the split, but
-    /// without the misses (`mask.A` = 0) for normal and position. Every file's header is checked, and the
-    /// split's files are read whole.
-    Stats(Stats),
+    /// Training normalises features with these numbers. They cover every pixel of the split; normal
+    /// and position exclude misses (`mask.A` = 0). The command checks every file's header and reads
+    /// the split's files completely.
+    Stats(StatsArguments),
 }
 
 /// Arguments of `inspect`.
 #[derive(Args)]
 #[command(after_help = "Example:\n  demc-data inspect data/sample/train/*.exr")]
-struct Inspect {
+struct InspectArguments {
     /// OpenEXR files: half, float or uint channels, one part or several, scan lines or tiles
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
@@ -55,7 +55,7 @@ struct Inspect {
 #[command(
     after_help = "Examples:\n  demc-data stats data/sample\n  demc-data stats renders --layout my-renderer.toml --json"
 )]
-struct Stats {
+struct StatsArguments {
     /// Directory of the data set, with its manifest.json
     #[arg(value_name = "DIR")]
     root: PathBuf,
@@ -71,14 +71,15 @@ struct Stats {
 }
 
 impl Cli {
-    /// Does what was asked for and says how it ended; `inspect` has then reported the files that it cannot use.
+    /// Runs the command and returns its exit status; `inspect` has already reported the files that
+    /// it could not read.
     ///
     /// # Errors
-    /// What ended the command, not yet reported.
+    /// An error that ended the command and is not yet reported.
     pub fn run(self) -> Result<ExitCode> {
         match self.command {
-            Command::Inspect(args) => inspect::run(&args.files, args.json),
-            Command::Stats(args) => stats::run(&args.root, &args.layout, args.split, args.json)
+            DataCommand::Inspect(args) => inspect::run(&args.files, args.json),
+            DataCommand::Stats(args) => stats::run(&args.root, &args.layout, args.split, args.json)
                 .map(|()| ExitCode::SUCCESS),
         }
     }
@@ -97,7 +98,7 @@ fn parse_split(text: &str) -> Result<Split, String> {
     }
 }
 
-/// Prints to standard output; whoever reads it may stop reading early.
+/// Prints to standard output; the reader may close it early.
 fn print(text: &str) -> Result<()> {
     match std::io::stdout().write_all(text.as_bytes()) {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
@@ -105,7 +106,7 @@ fn print(text: &str) -> Result<()> {
     }
 }
 
-/// Six significant digits or so, in at most eleven characters.
+/// About six significant digits, in at most eleven characters.
 fn number(value: f64) -> String {
     match value.abs() {
         0.0 => "0".to_owned(),

@@ -10,38 +10,42 @@ use demc_data::patch::patches;
 use demc_data::{ChannelLayout, DataConfig, Dataset, Scene, Split, Statistics};
 use serde::Serialize;
 
-/// What is known of a data set.
+/// Epsilon of Eq. 5 (Sec. 4.2).
+const RELMSE_EPSILON: f32 = 0.001;
+
+/// The measurements of a data set.
 #[derive(Serialize)]
-struct Report<'a> {
+struct DatasetReport<'a> {
     root: &'a Path,
     layout: &'a str,
     /// All splits that have scenes.
-    splits: BTreeMap<Split, Contents>,
-    /// The split that the rest was measured on.
+    splits: BTreeMap<Split, SplitContents>,
+    /// The split of the measurements below.
     split: Split,
     pixels: u64,
-    /// Share of the pixels that hit nothing.
+    /// Share of the pixels whose camera rays hit nothing.
     misses: f64,
     /// Negative samples of colour and reference, which are set to 0.
     negative: u64,
     /// Mean and standard deviation of each feature.
-    features: Vec<Feature>,
+    features: Vec<FeatureRow>,
     /// The constant reference colour with the least RelMSE, in gamma space.
     flat_color: [f32; 3],
 }
 
 #[derive(Serialize)]
-struct Contents {
+struct SplitContents {
     scenes: usize,
     base_scenes: BTreeSet<String>,
-    /// How many scenes have each size.
+    /// Number of scenes of each size.
     sizes: BTreeMap<String, usize>,
-    /// Patches of the default size, stride and border; none if a scene is too small to hold one.
+    /// Number of patches of the default size, stride and border; none if a scene is too small for a
+    /// patch.
     patches: Option<usize>,
 }
 
 #[derive(Serialize)]
-struct Feature {
+struct FeatureRow {
     name: &'static str,
     mean: f32,
     std: f32,
@@ -53,7 +57,13 @@ pub fn run(root: &Path, layout_name: &str, split: Split, json: bool) -> Result<(
     let dataset = Dataset::open(root, &layout)?;
     let config = DataConfig::default();
     let scenes = dataset.split(split)?;
-    let measured = Statistics::measure(&scenes, &layout, config.gamma, config.demodulate)?;
+    let measured = Statistics::measure(
+        &scenes,
+        &layout,
+        config.gamma,
+        config.albedo_demodulation_epsilon,
+        RELMSE_EPSILON,
+    )?;
     let splits = [Split::Train, Split::Test].into_iter().filter_map(|split| {
         let scenes = dataset.split(split).ok()?;
         Some((split, contents(&scenes, &config)))
@@ -64,7 +74,7 @@ pub fn run(root: &Path, layout_name: &str, split: Split, json: bool) -> Result<(
         .mean
         .into_iter()
         .zip(normalizer.features.std);
-    let report = Report {
+    let report = DatasetReport {
         root,
         layout: layout_name,
         splits: splits.collect(),
@@ -75,7 +85,7 @@ pub fn run(root: &Path, layout_name: &str, split: Split, json: bool) -> Result<(
         features: FEATURE_NAMES
             .into_iter()
             .zip(stats)
-            .map(|(name, (mean, std))| Feature { name, mean, std })
+            .map(|(name, (mean, std))| FeatureRow { name, mean, std })
             .collect(),
         flat_color: normalizer.flat_color,
     };
@@ -86,14 +96,14 @@ pub fn run(root: &Path, layout_name: &str, split: Split, json: bool) -> Result<(
     }
 }
 
-fn contents(scenes: &[Scene], config: &DataConfig) -> Contents {
+fn contents(scenes: &[Scene], config: &DataConfig) -> SplitContents {
     let mut sizes = BTreeMap::new();
     for scene in scenes {
         *sizes
             .entry(format!("{}x{}", scene.width, scene.height))
             .or_default() += 1;
     }
-    Contents {
+    SplitContents {
         scenes: scenes.len(),
         base_scenes: scenes.iter().map(|scene| scene.base.clone()).collect(),
         sizes,
@@ -103,7 +113,7 @@ fn contents(scenes: &[Scene], config: &DataConfig) -> Contents {
     }
 }
 
-fn table(report: &Report<'_>, config: &DataConfig) -> String {
+fn table(report: &DatasetReport<'_>, config: &DataConfig) -> String {
     let mut text = format!("{} (layout {})\n", report.root.display(), report.layout);
     // Writing to a String cannot fail.
     for (split, contents) in &report.splits {
@@ -138,7 +148,7 @@ fn table(report: &Report<'_>, config: &DataConfig) -> String {
         report.negative
     );
     let _ = writeln!(text, "  {:10}  {:>11}  {:>11}", "feature", "mean", "std");
-    for Feature { name, mean, std } in &report.features {
+    for FeatureRow { name, mean, std } in &report.features {
         let (mean, std) = (
             super::number(f64::from(*mean)),
             super::number(f64::from(*std)),

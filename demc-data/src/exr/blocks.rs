@@ -1,7 +1,9 @@
-//! Blocks of pixels by their place in the image, as the file has them. The file is not trusted: what it says is held against its length
-//! before memory is allocated for it.
+//! Blocks of pixels by their position in the image. The file is not trusted: its claims are checked
+//! against its length before memory is allocated.
 
+use std::collections::HashMap;
 use std::io::{Read, Seek, SeekFrom};
+use std::mem::size_of;
 
 use ::exr::block::UncompressedBlock;
 use ::exr::block::chunk::{
@@ -13,55 +15,55 @@ use ::exr::meta::{BlockDescription, MetaData, compute_block_count};
 use ::exr::prelude::Vec2;
 
 use super::decode::{check_density, decompress};
-use super::kept::Kept;
-use super::{MAX_PIXELS, MAX_SIDE};
+use super::{MAX_PIXELS, MAX_SIDE, invalid};
 use crate::parallel;
 
-/// Blocks that are decoded or coded at once, in bytes of pixels, but at least one for each thread (ours: little beside an
-/// image).
+/// Bytes of pixels that are decoded or encoded at once, but at least one block per thread (ours:
+/// small compared with an image).
 const BATCH_BYTES: usize = 8 << 20;
 
-/// Headers of a file, and its blocks on demand.
-pub(super) struct Source<R> {
+/// The headers of a file, and its blocks on demand.
+pub(super) struct BlockReader<R> {
     reader: R,
     pub(super) meta: MetaData,
-    /// Where the tables of block offsets begin, one a part.
+    /// Start of the tables of block offsets, one per part.
     tables: u64,
-    /// Where they end and blocks begin.
+    /// End of the tables and start of the blocks.
     blocks: u64,
-    /// Bytes in the file.
+    /// Length of the file in bytes.
     length: u64,
-    /// How many decode and code blocks.
+    /// Number of threads that decode and encode blocks.
     pub(super) threads: usize,
-    pub(super) kept: Kept,
+    pub(super) kept: DecodedBlocks,
 }
 
 /// Column and row of a block.
-pub(super) type Place = (usize, usize);
+pub(super) type BlockPosition = (usize, usize);
 
-enum Block {
+enum LoadedBlock {
     Compressed(Chunk),
     Decoded(UncompressedBlock),
 }
 
-/// The blocks of a part in its full size, in rows from the top; a block of scan lines is as wide as the image.
-pub(super) struct Grid {
+/// The blocks of a part at full size, in rows from the top. A block of scan lines is as wide as the
+/// image.
+pub(super) struct BlockGrid {
     pub(super) columns: usize,
     pub(super) rows: usize,
     pub(super) block: Vec2<usize>,
-    /// Offsets of all blocks of the part; those of smaller levels come last.
+    /// Offsets of all blocks of the part; smaller levels come last.
     offsets: Vec<u64>,
 }
 
-impl Grid {
+impl BlockGrid {
     /// The block that holds this pixel.
-    pub(super) fn place(&self, pixel: Vec2<usize>) -> Place {
+    pub(super) fn place(&self, pixel: Vec2<usize>) -> BlockPosition {
         let Vec2(column, row) = pixel / self.block;
         (column, row)
     }
 }
 
-impl<R: Read + Seek> Source<R> {
+impl<R: Read + Seek> BlockReader<R> {
     /// Reads the headers and checks them.
     pub(super) fn open(mut reader: R) -> Result<Self, ExrError> {
         let length = reader.seek(SeekFrom::End(0))?;
@@ -85,11 +87,11 @@ impl<R: Read + Seek> Source<R> {
             blocks,
             length,
             threads: parallel::available(),
-            kept: Kept::default(),
+            kept: DecodedBlocks::default(),
         })
     }
 
-    /// How many blocks of a part are decoded or coded at once.
+    /// Number of blocks of a part that are decoded or encoded at once.
     pub(super) fn batch(&self, header: &Header) -> usize {
         let blocks = BATCH_BYTES / block_bytes(header).max(1);
         blocks.next_multiple_of(self.threads).max(self.threads)
@@ -97,12 +99,12 @@ impl<R: Read + Seek> Source<R> {
 
     /// The table of a part's blocks.
     ///
-    /// Refuses a part whose pixels are more than the whole file can stand for.
-    pub(super) fn grid(&mut self, part: usize) -> Result<Grid, ExrError> {
+    /// Refuses a part whose pixels cannot fit in the whole file.
+    pub(super) fn grid(&mut self, part: usize) -> Result<BlockGrid, ExrError> {
         let header = &self.meta.headers[part];
         let (size, block) = (header.layer_size, header.max_block_pixel_size());
         check_density(header, size.area(), self.length)?;
-        Ok(Grid {
+        Ok(BlockGrid {
             columns: compute_block_count(size.width(), block.width()),
             rows: compute_block_count(size.height(), block.height()),
             block,
@@ -110,30 +112,35 @@ impl<R: Read + Seek> Source<R> {
         })
     }
 
-    /// Decodes blocks of the full-size image, but for those that were kept.
+    /// Decodes blocks of the full-size image, except for cached ones.
     pub(super) fn decode(
         &mut self,
         part: usize,
-        grid: &Grid,
-        places: &[Place],
+        grid: &BlockGrid,
+        places: &[BlockPosition],
     ) -> Result<Vec<UncompressedBlock>, ExrError> {
         let blocks = places
             .iter()
             .map(|&place| match self.kept.take(part, place) {
-                Some(block) => Ok(Block::Decoded(block)),
-                None => self.block(part, grid, place).map(Block::Compressed),
+                Some(block) => Ok(LoadedBlock::Decoded(block)),
+                None => self.block(part, grid, place).map(LoadedBlock::Compressed),
             });
-        let blocks: Vec<Block> = blocks.collect::<Result<_, _>>()?;
+        let blocks: Vec<LoadedBlock> = blocks.collect::<Result<_, _>>()?;
         let meta = &self.meta;
         let blocks = parallel::map(self.threads, blocks, |block| match block {
-            Block::Decoded(block) => Ok(block),
-            Block::Compressed(chunk) => decompress(meta, chunk),
+            LoadedBlock::Decoded(block) => Ok(block),
+            LoadedBlock::Compressed(chunk) => decompress(meta, chunk),
         });
         blocks.into_iter().collect()
     }
 
-    /// Reads the block in this place of the full-size image, still compressed.
-    fn block(&mut self, part: usize, grid: &Grid, (column, row): Place) -> Result<Chunk, ExrError> {
+    /// Reads the block at this position of the full-size image, still compressed.
+    fn block(
+        &mut self,
+        part: usize,
+        grid: &BlockGrid,
+        (column, row): BlockPosition,
+    ) -> Result<Chunk, ExrError> {
         let place = TileCoordinates {
             tile_index: Vec2(column, row),
             level_index: Vec2(0, 0),
@@ -143,21 +150,22 @@ impl<R: Read + Seek> Source<R> {
         self.chunk(part, offset, place)
     }
 
-    /// Where the blocks of a part are, in the order of the format: levels, then rows, then columns.
+    /// Offsets of the blocks of a part, in the order of the format: levels, then rows, then
+    /// columns.
     pub(super) fn offsets(&mut self, part: usize) -> Result<Vec<u64>, ExrError> {
         let headers = &self.meta.headers;
         let before: usize = headers[..part].iter().map(|h| h.chunk_count).sum();
         let count = headers[part].chunk_count;
         self.reader
             .seek(SeekFrom::Start(self.tables + 8 * before as u64))?;
-        // At most the file's own length: see `open`.
+        // At most the length of the file: see `open`.
         let mut bytes = vec![0; 8 * count];
         self.reader.read_exact(&mut bytes)?;
         let offsets = bytes.as_chunks().0.iter();
         Ok(offsets.map(|&bytes| u64::from_le_bytes(bytes)).collect())
     }
 
-    /// Reads the block at an offset, still compressed, and checks that it is the one that belongs to `place`.
+    /// Reads the block at an offset, still compressed, and checks that it belongs to `place`.
     pub(super) fn chunk(
         &mut self,
         part: usize,
@@ -199,11 +207,12 @@ impl<R: Read + Seek> Source<R> {
                 "it is cut short: a block has {size} bytes, {room} are left"
             )));
         }
-        // What does not shrink is stored as it is. Blocks may lie over each other: many of this size may come at once.
-        let most = block_bytes(header);
-        if size > most as u64 {
+        // An incompressible block is stored uncompressed. Blocks may overlap, so many blocks of
+        // this size may be read at once.
+        let limit = block_bytes(header);
+        if size > limit as u64 {
             return Err(invalid(format!(
-                "a block has {size} bytes for {most} bytes of pixels"
+                "a block has {size} bytes for {limit} bytes of pixels"
             )));
         }
         let mut compressed_pixels_le = Vec::with_capacity(usize::try_from(size)?);
@@ -226,15 +235,66 @@ impl<R: Read + Seek> Source<R> {
     }
 }
 
-/// Bytes of pixels of a part's largest block.
+/// Part and position.
+type BlockKey = (usize, BlockPosition);
+
+/// Decoded blocks of some parts, up to a memory limit.
+#[derive(Default)]
+pub(super) struct DecodedBlocks {
+    /// The parts whose blocks are kept.
+    parts: Vec<usize>,
+    blocks: HashMap<BlockKey, UncompressedBlock>,
+    /// Bytes of all blocks, and their limit.
+    bytes: usize,
+    limit: usize,
+}
+
+impl DecodedBlocks {
+    /// Keeps blocks of these parts, up to `limit` bytes.
+    pub(super) fn new(parts: Vec<usize>, limit: usize) -> Self {
+        Self {
+            parts,
+            limit,
+            ..Self::default()
+        }
+    }
+
+    /// Keeps the blocks of a part that fit within the limit.
+    pub(super) fn keep(
+        &mut self,
+        part: usize,
+        places: &[BlockPosition],
+        blocks: Vec<UncompressedBlock>,
+    ) {
+        if !self.parts.contains(&part) {
+            return;
+        }
+        for (place, block) in places.iter().zip(blocks) {
+            let bytes = self.bytes.saturating_add(bytes(&block));
+            if bytes <= self.limit {
+                self.bytes = bytes;
+                self.blocks.insert((part, *place), block);
+            }
+        }
+    }
+
+    /// Removes and returns a block.
+    pub(super) fn take(&mut self, part: usize, place: BlockPosition) -> Option<UncompressedBlock> {
+        let block = self.blocks.remove(&(part, place))?;
+        self.bytes -= bytes(&block);
+        Some(block)
+    }
+}
+
+fn bytes(block: &UncompressedBlock) -> usize {
+    block.data.len() + size_of::<BlockKey>() + size_of::<UncompressedBlock>()
+}
+
+/// Bytes of pixels in a part's largest block.
 fn block_bytes(header: &Header) -> usize {
     let (block, image) = (header.max_block_pixel_size(), header.layer_size);
     let pixels = block.width().min(image.width()) * block.height().min(image.height());
     pixels.saturating_mul(header.channels.bytes_per_pixel)
-}
-
-pub(super) fn invalid(detail: String) -> ExrError {
-    ExrError::Invalid(detail.into())
 }
 
 fn integer(reader: &mut impl Read) -> Result<i32, ExrError> {

@@ -1,36 +1,36 @@
-//! The compressions of the format by the names that its tools give them.
+//! Compression methods, named as in OpenEXR's tools.
 
 use std::fmt;
 use std::str::FromStr;
 
 use ::exr::prelude::Compression as Method;
 
-/// A compression that can be written.
+/// A compression that this crate can write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Compression {
     /// None.
     None,
     /// Runs of equal bytes.
     Rle,
-    /// Deflate, a line at a time.
+    /// Deflate, one line at a time.
     Zips,
     /// Deflate, 16 lines at a time.
     Zip,
-    /// Wavelets and Huffman codes, 32 lines at a time: best for grain.
+    /// Wavelets and Huffman codes, 32 lines at a time; smallest for noisy images.
     Piz,
     /// Deflate of 24 bits: `float` channels lose their last 8.
     Pxr24,
     /// Blocks of 4x4 pixels at a fixed rate: `half` channels lose precision.
     B44,
-    /// The same, with flat blocks in less.
+    /// As B44, with smaller flat blocks.
     B44a,
-    /// Cosine transform, 32 lines at a time, with loss.
+    /// Lossy cosine transform, 32 lines at a time.
     Dwaa,
-    /// The same, 256 lines at a time.
+    /// As DWAA, 256 lines at a time.
     Dwab,
 }
 
-/// Name, ours and the `exr` crate's; those of no name of ours cannot be written.
+/// Name, our type and the `exr` crate's type. Methods without our type cannot be written.
 const TABLE: [(&str, Option<Compression>, Method); 12] = [
     ("none", Some(Compression::None), Method::Uncompressed),
     ("rle", Some(Compression::Rle), Method::RLE),
@@ -46,13 +46,13 @@ const TABLE: [(&str, Option<Compression>, Method); 12] = [
     ("htj2k256", None, Method::HTJ2K256),
 ];
 
-/// A name that no compression has.
+/// An unknown compression name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("no compression {0:?}; there are {names}", names = Compression::ALL.map(Compression::name).join(", "))]
+#[error("unknown compression {0:?}; expected one of {names}", names = Compression::ALL.map(Compression::name).join(", "))]
 pub struct UnknownCompression(pub String);
 
 impl Compression {
-    /// All of them.
+    /// All compressions.
     pub const ALL: [Self; 10] = [
         Self::None,
         Self::Rle,
@@ -66,7 +66,7 @@ impl Compression {
         Self::Dwab,
     ];
 
-    /// Its name: `zip`, `dwaa`.
+    /// Its name, such as `zip` or `dwaa`.
     pub fn name(self) -> &'static str {
         let row = TABLE.iter().find(|(_, ours, _)| *ours == Some(self));
         row.map_or("", |(name, ..)| name)
@@ -77,7 +77,7 @@ impl Compression {
         row.map_or(Method::ZIP16, |(.., method)| *method)
     }
 
-    /// `None` for what cannot be written.
+    /// `None` for a method that cannot be written.
     pub(super) fn of(method: Method) -> Option<Self> {
         row_of(method).and_then(|(_, ours, _)| *ours)
     }
@@ -89,7 +89,7 @@ pub(super) fn name_of(method: Method) -> &'static str {
 }
 
 fn row_of(method: Method) -> Option<&'static (&'static str, Option<Compression>, Method)> {
-    // A DWA method carries a level, which is no other method.
+    // Compares variants only, because a DWA method carries a level.
     let kind = std::mem::discriminant(&method);
     TABLE
         .iter()
@@ -130,6 +130,8 @@ mod tests {
             .parse::<Compression>()
             .expect_err("no such")
             .to_string();
-        assert!(error.starts_with("no compression \"lzma\"; there are none, rle, zips, zip, piz"));
+        assert!(error.starts_with(
+            "unknown compression \"lzma\"; expected one of none, rle, zips, zip, piz"
+        ));
     }
 }

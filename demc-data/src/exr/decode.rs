@@ -1,4 +1,5 @@
-//! From a block's bytes to its samples. The file is not trusted: what a block promises is held against its length first.
+//! Decompression of blocks. The file is not trusted: a block's claims are checked against its
+//! length first.
 
 use ::exr::block::UncompressedBlock;
 use ::exr::block::chunk::{Chunk, CompressedBlock, CompressedScanLineBlock, CompressedTileBlock};
@@ -8,15 +9,15 @@ use ::exr::meta::attribute::ChannelList;
 use ::exr::meta::header::Header;
 use ::exr::prelude::{Compression, Vec2};
 
-use super::blocks::invalid;
+use super::invalid;
 
 /// A DWA block starts with this many 64-bit numbers: sizes, a version and a method.
 const DWA_SIZES: usize = 11;
-/// What compression may add to a part of a DWA block that does not shrink, in bytes (ours).
+/// Bytes that compression may add to a part of an incompressible DWA block (ours).
 const DWA_MARGIN: u64 = 1 << 16;
 
-/// Decompresses a block. Decoders allocate for all the pixels that it should have, and for the sizes at the start
-/// of a DWA block whatever they are: both are checked first.
+/// Decompresses a block. Decoders allocate memory for all its pixels, and for the sizes at the
+/// start of a DWA block. Both are checked first.
 pub(super) fn decompress(meta: &MetaData, chunk: Chunk) -> Result<UncompressedBlock, ExrError> {
     let header = &meta.headers[chunk.layer_index];
     let place = header.get_block_data_indices(&chunk.compressed_block)?;
@@ -34,11 +35,12 @@ pub(super) fn decompress(meta: &MetaData, chunk: Chunk) -> Result<UncompressedBl
         if let Compression::DWAA(_) | Compression::DWAB(_) = header.compression {
             let sizes = bytes.as_chunks().0.iter().take(DWA_SIZES);
             let mut sizes = sizes.map(|&bytes| u64::from_le_bytes(bytes));
-            // Samples of squares of 8, the cut ones too, of two bytes or of four, and what compression may add.
+            // Samples of 8x8 squares, including partial ones, of two or four bytes, plus the growth
+            // that compression may add.
             let Vec2(width, height) = area;
             let padded = width.next_multiple_of(8) * height.next_multiple_of(8);
-            let most = 2 * padded as u64 * header.channels.bytes_per_pixel as u64 + DWA_MARGIN;
-            if sizes.any(|size| size > most) {
+            let limit = 2 * padded as u64 * header.channels.bytes_per_pixel as u64 + DWA_MARGIN;
+            if sizes.any(|size| size > limit) {
                 return Err(invalid(
                     "the sizes in a DWA block are impossible".to_owned(),
                 ));
@@ -48,18 +50,18 @@ pub(super) fn decompress(meta: &MetaData, chunk: Chunk) -> Result<UncompressedBl
     UncompressedBlock::decompress_chunk(chunk, meta, false)
 }
 
-/// Where a channel's samples are in the lines of a part's blocks.
+/// Location of a channel's samples in the lines of a part's blocks.
 #[derive(Clone, Copy)]
-pub(super) struct Span {
-    /// Bytes of a pixel in all channels, and in those before this one.
+pub(super) struct SampleSpan {
+    /// Bytes per pixel in all channels, and in the channels before this one.
     pixel: usize,
     before: usize,
-    /// Bytes of a sample.
+    /// Bytes per sample.
     sample: usize,
 }
 
-impl Span {
-    /// That of the channel with this index.
+impl SampleSpan {
+    /// The location of the channel with this index.
     ///
     /// # Panics
     /// If the part has no such channel.
@@ -85,7 +87,7 @@ impl Span {
     }
 }
 
-/// Checks that so many bytes can stand for so many pixels.
+/// Checks that this many bytes can encode this many pixels.
 pub(super) fn check_density(header: &Header, pixels: usize, bytes: u64) -> Result<(), ExrError> {
     let decoded = pixels as u64 * header.channels.bytes_per_pixel as u64;
     match decoded <= bytes.saturating_mul(densest(header.compression)) {
@@ -97,22 +99,22 @@ pub(super) fn check_density(header: &Header, pixels: usize, bytes: u64) -> Resul
     }
 }
 
-/// The most bytes of pixels that a compressed byte can stand for.
+/// Maximum number of bytes of pixels per compressed byte.
 fn densest(compression: Compression) -> u64 {
     match compression {
         Compression::Uncompressed => 1,
-        // A run of 128 in two bytes.
+        // A run of 128 bytes in two bytes.
         Compression::RLE => 64,
         // Deflate: 258 bytes in two bits.
         Compression::ZIP1 | Compression::ZIP16 => 1032,
-        // Deflate, of three bytes in four.
+        // Deflate, of three bytes out of four.
         Compression::PXR24 => 1376,
         // Huffman codes: a run of 256 samples of two bytes in ten bits.
         Compression::PIZ => 512,
         // 16 samples of two bytes in three bytes.
         Compression::B44 | Compression::B44A => 11,
-        // A flat square of 64 samples of four bytes is a number for its mean and one for the rest: 258 bytes of each in
-        // two bits.
+        // A flat 8x8 square of four-byte samples is two numbers, one for its mean and one for the
+        // rest. Deflate stores 258 bytes of each in two bits.
         Compression::DWAA(_) | Compression::DWAB(_) => 1 << 17,
         Compression::HTJ2K32 | Compression::HTJ2K256 => u64::MAX,
     }

@@ -1,24 +1,26 @@
-//! OpenEXR in and out, and the only place that imports the `exr` crate.
+//! Reading and writing OpenEXR files. Only this module imports the `exr` crate.
 //!
-//! Reading ([`ExrFile`]) is in two steps: [`ExrFile::open`] reads and checks the headers, [`ExrFile::read`] decodes the
-//! channels that are asked for, each in its own precision. A channel's name is `Layer.channel` in a file of several
-//! parts and the channel's own name (dots and all) in a file of one. [`write_rgb`] writes three channels and nothing
-//! else; [`rewrite`] writes a file again with another colour.
+//! Reading takes two steps: [`ExrFile::open`] reads and checks the headers, [`ExrFile::read`]
+//! decodes the requested channels, each in its own precision. A channel's name is `Layer.channel`
+//! in a file of several parts, and the channel's own name (including dots) in a file of one part.
 //!
-//! # What is read
-//! Files of OpenEXR 2 with one part or several, of scan lines or tiles, in every compression but HTJ2K. Of an image with
-//! smaller levels (mip or rip maps) the full size is read. Deep and subsampled channels are refused.
+//! [`write_rgb`] writes only three channels. [`rewrite`] copies a file with a different colour.
 //!
-//! # Files of strangers
-//! A header is checked before anything of the size that it claims is allocated: [`MAX_SIDE`], [`MAX_PIXELS`], and
-//! that the table of blocks fits into the file. So is a block: it has to be as long as the file is, and its pixels are
-//! not more than its bytes can stand for. Planes grow with the rows that were decoded.
+//! # Supported files
+//!
+//! OpenEXR 2 files with one or several parts, of scan lines or tiles, in every compression except
+//! HTJ2K. If an image has smaller levels (mip or rip maps), the full size is read. Deep and
+//! subsampled channels are refused.
+//!
+//! # Untrusted files
+//!
+//! A header is checked before memory of the claimed size is allocated: [`MAX_SIDE`],
+//! [`MAX_PIXELS`], and that the table of blocks fits in the file. A block must fit in the file, and
+//! its bytes must be able to encode its pixels. Planes grow as rows are decoded.
 
-mod attributes;
 mod blocks;
 mod compression;
 mod decode;
-mod kept;
 mod plan;
 mod read;
 mod recode;
@@ -36,25 +38,26 @@ use crate::Error;
 
 pub use compression::{Compression, UnknownCompression};
 pub use read::ExrFile;
-pub use write::{Precision, write_rgb};
+pub use write::{SamplePrecision, write_rgb};
 
-/// Largest accepted width or height, in pixels (ours: four times an 8K frame's width).
+/// Maximum width or height in pixels (ours: four times the width of an 8K frame).
 pub const MAX_SIDE: usize = 32_768;
-/// Largest accepted number of pixels of a part (ours: 16K x 8K), so that a damaged header cannot ask for
-/// all the memory there is.
+/// Maximum number of pixels of a part (ours: 16K x 8K), so that a damaged header cannot request all
+/// memory.
 pub const MAX_PIXELS: usize = 1 << 27;
 
-/// What is said of a file that uses more of the format than is read.
+/// The hint for a file with unsupported features.
 const SUPPORTED: &str =
     "expected OpenEXR 2 with scan lines or tiles, neither deep nor subsampled, not HTJ2K";
 
-/// Runs the decoder; damaged bytes can fail its internal assertions, which must not end the program.
+/// Runs the decoder. Damaged bytes can violate its internal assertions, which must not end the
+/// program.
 fn guarded<T>(path: &Path, work: impl FnOnce() -> Result<T, ExrError>) -> Result<T, Error> {
     match catch_unwind(AssertUnwindSafe(work)) {
         Ok(done) => done.map_err(|error| reading_error(path, error)),
         Err(_) => Err(undecodable(
             path,
-            "the decoder gave up on damaged data".to_owned(),
+            "the decoder failed on damaged data".to_owned(),
         )),
     }
 }
@@ -79,4 +82,8 @@ fn undecodable(path: &Path, detail: String) -> Error {
         path: path.to_owned(),
         detail,
     }
+}
+
+fn invalid(detail: String) -> ExrError {
+    ExrError::Invalid(detail.into())
 }

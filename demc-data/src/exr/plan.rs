@@ -1,5 +1,6 @@
-//! What a rewritten file consists of: its headers, and where the channels of each part come from.
+//! The plan of a rewritten file: its headers, and the source of each part's channels.
 
+use std::fmt;
 use std::io::{Read, Seek};
 
 use ::exr::meta::attribute::{ChannelList, LevelMode, SampleType};
@@ -8,38 +9,112 @@ use ::exr::meta::{BlockDescription, Headers};
 
 use super::compression::name_of;
 use super::read::printable;
-use super::rewrite::{Change, Keep, WriteOptions};
-use super::{Compression, ExrFile, Precision, undecodable};
+use super::{Compression, ExrFile, SamplePrecision, undecodable};
 use crate::channel::Channel;
 use crate::{ChannelLayout, Error};
 
-/// The output.
-pub(super) struct Plan {
+/// Options for writing a denoised image.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct WriteOptions {
+    /// Channels of the input to keep.
+    pub channels: OutputChannels,
+    /// Type of the colour channels; `None`: as in the input (`float` instead of `uint`).
+    pub precision: Option<SamplePrecision>,
+    /// Compression of the parts with colour; `None`: as in the input. If that would change other
+    /// channels or cannot be written, [`Compression::Zip`].
+    pub compression: Option<Compression>,
+}
+
+/// Channels of the input to keep in the output.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum OutputChannels {
+    /// All channels.
+    #[default]
+    All,
+    /// Only colour, and the alpha channel of the same part (`A` beside `R`, `beauty.A` beside
+    /// `beauty.R`).
+    Color,
+}
+
+/// A difference between the layouts of input and output.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Change {
+    /// The input's compression would have changed other channels or cannot be written.
+    Compression {
+        /// The part's name; empty if it has none.
+        part: String,
+        /// The compression of the input.
+        from: &'static str,
+        /// The compression of the output.
+        to: Compression,
+    },
+    /// The requested compression changes the other channels.
+    Lossy {
+        /// The part's name; empty if it has none.
+        part: String,
+        /// The requested compression.
+        to: Compression,
+    },
+    /// Smaller copies of the image (mip or rip levels) were dropped, because they show the noise.
+    Levels {
+        /// The part's name; empty if it has none.
+        part: String,
+    },
+}
+
+impl fmt::Display for Change {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (Change::Compression { part, .. }
+        | Change::Lossy { part, .. }
+        | Change::Levels { part }) = self;
+        if !part.is_empty() {
+            write!(f, "part {part}: ")?;
+        }
+        match self {
+            Change::Compression { from, to, .. } => {
+                write!(
+                    f,
+                    "compressed with {to} instead of {from}, so that the other channels stay unchanged"
+                )
+            }
+            Change::Lossy { to, .. } => {
+                write!(
+                    f,
+                    "compressed with {to}, which also changes the other channels"
+                )
+            }
+            Change::Levels { .. } => f.write_str("written without its smaller levels"),
+        }
+    }
+}
+
+/// The plan of an output file.
+pub(super) struct RewritePlan {
     pub(super) headers: Headers,
     /// One for each header.
-    pub(super) parts: Vec<Part>,
+    pub(super) parts: Vec<PlannedPart>,
     pub(super) changes: Vec<Change>,
 }
 
-/// Where the pixels of a part of the output come from.
-pub(super) struct Part {
+/// The source of a part of the output.
+pub(super) struct PlannedPart {
     /// The part's index in the input.
     pub(super) input: usize,
-    /// Its channels, in the header's order; `None` if the input's blocks are copied.
-    pub(super) channels: Option<Vec<Origin>>,
+    /// Its channels, in the order of the header; `None` if the blocks of the input are copied.
+    pub(super) channels: Option<Vec<ChannelOrigin>>,
 }
 
-/// Where a channel of the output comes from.
+/// The source of a channel of the output.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Origin {
+pub(super) struct ChannelOrigin {
     /// Its index in the input's part.
     pub(super) index: usize,
-    /// The plane of the denoised colour that takes its place.
+    /// The plane of the denoised colour that replaces it.
     pub(super) plane: Option<usize>,
 }
 
-impl Plan {
-    /// Plans the output for a denoised colour of so many samples.
+impl RewritePlan {
+    /// Plans the output for a denoised colour of `samples` samples.
     pub(super) fn new<R: Read + Seek>(
         file: &ExrFile<R>,
         layout: &ChannelLayout,
@@ -54,7 +129,7 @@ impl Plan {
         };
         for (input, header) in file.source.meta.headers.iter().enumerate() {
             let channels = file.channels().iter().filter(|c| c.part == input);
-            let origins: Vec<Origin> = channels
+            let origins: Vec<ChannelOrigin> = channels
                 .filter_map(|channel| origin(channel, &color, options.channels))
                 .collect();
             if origins.is_empty() {
@@ -66,13 +141,13 @@ impl Plan {
                 false => header.clone(),
             });
             let channels = colored.then_some(origins);
-            plan.parts.push(Part { input, channels });
+            plan.parts.push(PlannedPart { input, channels });
         }
         Ok(plan)
     }
 }
 
-/// The layout's colour channels in the file.
+/// The channels in the file that the layout names as colour.
 fn color_channels<'a, R: Read + Seek>(
     file: &'a ExrFile<R>,
     layout: &ChannelLayout,
@@ -92,27 +167,28 @@ fn color_channels<'a, R: Read + Seek>(
         });
     }
     if 3 * window.width * window.height != samples {
-        let detail = format!("{samples} samples of colour do not fit into {window}, its size now");
+        let detail = format!("{samples} samples of colour do not match {window}, its current size");
         return Err(undecodable(file.path(), detail));
     }
     Ok(channels)
 }
 
-/// What a channel of the input is in the output; `None` if it is left out.
-fn origin(channel: &Channel, color: &[&Channel], keep: Keep) -> Option<Origin> {
+/// The source of an output channel; `None` if the channel is dropped.
+fn origin(channel: &Channel, color: &[&Channel], keep: OutputChannels) -> Option<ChannelOrigin> {
     let index = channel.index;
     let plane = color
         .iter()
         .position(|c| (c.part, c.index) == (channel.part, index));
-    let stays = plane.is_some() || keep == Keep::All || is_alpha(channel, color);
-    stays.then_some(Origin { index, plane })
+    let stays = plane.is_some() || keep == OutputChannels::All || is_alpha(channel, color);
+    stays.then_some(ChannelOrigin { index, plane })
 }
 
-/// `A` beside `R`, `beauty.A` beside `beauty.R`, in one part.
+/// Whether this is an alpha channel of the colour: `A` beside `R`, or `beauty.A` beside `beauty.R`,
+/// in one part.
 fn is_alpha(channel: &Channel, color: &[&Channel]) -> bool {
     let split = |name: &str| {
-        let at = name.rfind('.').map_or(0, |dot| dot + 1);
-        (name[..at].to_owned(), name[at..].to_owned())
+        let start = name.rfind('.').map_or(0, |dot| dot + 1);
+        (name[..start].to_owned(), name[start..].to_owned())
     };
     let (prefix, suffix) = split(&channel.name);
     let beside = |c: &&Channel| c.part == channel.part && split(&c.name).0 == prefix;
@@ -122,7 +198,7 @@ fn is_alpha(channel: &Channel, color: &[&Channel]) -> bool {
 /// The header of a part with colour.
 fn colored_header(
     input: &Header,
-    origins: &[Origin],
+    origins: &[ChannelOrigin],
     options: &WriteOptions,
     changes: &mut Vec<Change>,
 ) -> Header {
@@ -132,7 +208,7 @@ fn colored_header(
         let mut channel = input.channels.list[origin.index].clone();
         if origin.plane.is_some() {
             channel.sample_type = match options.precision {
-                Some(Precision::Half) => SampleType::F16,
+                Some(SamplePrecision::Half) => SampleType::F16,
                 None if channel.sample_type == SampleType::F16 => SampleType::F16,
                 _ => SampleType::F32,
             };

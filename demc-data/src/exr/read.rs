@@ -1,4 +1,4 @@
-//! Headers of a file and, on demand, its channels.
+//! The headers of a file and, on demand, its channels.
 
 use std::fs::{self, File};
 use std::io::{self, BufReader, Read, Seek};
@@ -11,19 +11,18 @@ use ::exr::meta::header::Header;
 use ::exr::prelude::Vec2;
 use half::f16;
 
-use super::blocks::{Place, Source, invalid};
-use super::decode::Span;
-use super::guarded;
-use super::kept::Kept;
-use crate::channel::{Channel, Kind, Window, full_name};
+use super::blocks::{BlockPosition, BlockReader, DecodedBlocks};
+use super::decode::SampleSpan;
+use super::{guarded, invalid};
+use crate::channel::{Channel, ChannelType, Window, full_name};
 use crate::parallel;
 use crate::plane::Plane;
 use crate::{ChannelLayout, Error};
 
-/// An open file whose headers were read and checked; its pixels were not decoded yet.
+/// An open file whose headers are read and checked; its pixels are not yet decoded.
 pub struct ExrFile<R = BufReader<File>> {
     path: PathBuf,
-    pub(super) source: Source<R>,
+    pub(super) source: BlockReader<R>,
     channels: Vec<Channel>,
 }
 
@@ -31,13 +30,14 @@ impl ExrFile {
     /// Opens `path` and reads its headers.
     ///
     /// # Errors
-    /// [`Error::Read`] if it cannot be opened or is no regular file, else as [`parse`](Self::parse).
+    /// [`Error::Read`] if it cannot be opened or is not a regular file, otherwise as
+    /// [`parse`](Self::parse).
     pub fn open(path: &Path) -> Result<Self, Error> {
         let read_error = |source| Error::Read {
             path: path.to_owned(),
             source,
         };
-        // Opening a FIFO would wait for somebody to write into it; reading a device need not end.
+        // Opening a FIFO would wait for a writer; reading a device may not end.
         if !fs::metadata(path).map_err(read_error)?.is_file() {
             let why = io::Error::new(io::ErrorKind::InvalidInput, "not a regular file");
             return Err(read_error(why));
@@ -48,13 +48,14 @@ impl ExrFile {
 }
 
 impl<R: Read + Seek> ExrFile<R> {
-    /// Reads the headers of a file that is open already, or in memory; `path` is what errors call it.
+    /// Reads the headers of an open file or a file in memory. Errors refer to it as `path`.
     ///
     /// # Errors
-    /// [`Error::Exr`] if it is no EXR file, its header is damaged or promises more than the file can hold, or a part is
-    /// empty or larger than [`MAX_SIDE`](super::MAX_SIDE) or [`MAX_PIXELS`](super::MAX_PIXELS).
+    /// [`Error::Exr`] if it is not an EXR file, or if its header is damaged or claims more than the
+    /// file can hold. Also if a part is empty or exceeds [`MAX_SIDE`](super::MAX_SIDE) or
+    /// [`MAX_PIXELS`](super::MAX_PIXELS).
     pub fn parse(path: &Path, reader: R) -> Result<Self, Error> {
-        let source = guarded(path, || Source::open(reader))?;
+        let source = guarded(path, || BlockReader::open(reader))?;
         let headers = &source.meta.headers;
         let several = headers.len() > 1;
         let parts = headers.iter().enumerate();
@@ -66,7 +67,7 @@ impl<R: Read + Seek> ExrFile<R> {
         })
     }
 
-    /// What errors call the file.
+    /// The file's name in errors.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -76,7 +77,7 @@ impl<R: Read + Seek> ExrFile<R> {
         &self.channels
     }
 
-    /// The channel of this name; the first, should there be several.
+    /// The channel with this name; the first one if there are several.
     pub fn channel(&self, name: &str) -> Option<&Channel> {
         self.channels.iter().find(|channel| channel.name == name)
     }
@@ -84,11 +85,11 @@ impl<R: Read + Seek> ExrFile<R> {
     /// Checks that the file has all these channels.
     ///
     /// # Errors
-    /// [`Error::MissingChannels`], naming those that it lacks, each once, and those that it has.
+    /// [`Error::MissingChannels`], naming each missing channel once, and the channels of the file.
     pub fn require(&self, names: &[&str]) -> Result<(), Error> {
         let mut missing: Vec<String> = Vec::new();
         for name in names.iter().filter(|name| self.channel(name).is_none()) {
-            // A texture that stands in for another is asked for twice.
+            // A texture that replaces another one is requested twice.
             if !missing.iter().any(|known| known == name) {
                 missing.push((*name).to_owned());
             }
@@ -108,27 +109,27 @@ impl<R: Read + Seek> ExrFile<R> {
         })
     }
 
-    /// Decodes and codes on so many threads, in place of as many as `RAYON_NUM_THREADS` says or as there are
+    /// Decodes and encodes on this many threads, instead of `RAYON_NUM_THREADS` or the number of
     /// processors.
     pub fn on_threads(mut self, threads: usize) -> Self {
         self.source.threads = threads.max(1);
         self
     }
 
-    /// Keeps what [`read`](Self::read) decodes of the parts with the layout's colour, up to so many bytes, for
-    /// [`rewrite`](super::rewrite::rewrite): that is then decompressed once, not twice.
+    /// Keeps decoded blocks of the parts with the layout's colour, up to `bytes` bytes.
+    /// [`rewrite`](super::rewrite::rewrite) then need not decompress them again.
     pub fn keeping(mut self, layout: &ChannelLayout, bytes: usize) -> Self {
         let color = layout.color.iter().filter_map(|name| self.channel(name));
-        self.source.kept = Kept::new(color.map(|channel| channel.part).collect(), bytes);
+        self.source.kept = DecodedBlocks::new(color.map(|channel| channel.part).collect(), bytes);
         self
     }
 
-    /// Decodes the named channels, in the order of `names`; other parts and smaller resolution levels are
-    /// not touched.
+    /// Decodes the named channels, in the order of `names`. Other parts and smaller levels are not
+    /// read.
     ///
     /// # Errors
-    /// [`Error::MissingChannels`] if the file lacks any; [`Error::Exr`] if the pixel data is cut short or
-    /// damaged, or there is no memory for it.
+    /// [`Error::MissingChannels`] if the file lacks any; [`Error::Exr`] if the pixel data is
+    /// truncated or damaged, or memory is insufficient.
     pub fn read(&mut self, names: &[&str]) -> Result<Vec<Plane>, Error> {
         self.require(names)?;
         let wanted: Vec<Channel> = names
@@ -149,9 +150,9 @@ fn channels_of(part: usize, header: &Header, several: bool) -> Vec<Channel> {
             &printable(&channel.name),
         ),
         kind: match channel.sample_type {
-            SampleType::F16 => Kind::Half,
-            SampleType::F32 => Kind::Float,
-            SampleType::U32 => Kind::Uint,
+            SampleType::F16 => ChannelType::Half,
+            SampleType::F32 => ChannelType::Float,
+            SampleType::U32 => ChannelType::Uint,
         },
         layer: layer.clone(),
         window: window_of(header),
@@ -161,7 +162,7 @@ fn channels_of(part: usize, header: &Header, several: bool) -> Vec<Channel> {
     channels.collect()
 }
 
-/// A name of the file, as it is shown: in a message of one line, on a terminal.
+/// A name from the file, safe to print in a one-line message on a terminal.
 pub(super) fn printable(name: &Text) -> String {
     let name = String::from_utf8_lossy(name.bytes());
     name.replace(char::is_control, "\u{fffd}")
@@ -169,7 +170,7 @@ pub(super) fn printable(name: &Text) -> String {
 
 /// Decodes every full-size block of the parts that hold a wanted channel.
 fn decode<R: Read + Seek>(
-    source: &mut Source<R>,
+    source: &mut BlockReader<R>,
     wanted: &[Channel],
 ) -> Result<Vec<Plane>, ExrError> {
     let mut planes: Vec<Plane> = wanted.iter().map(|channel| empty(channel.kind)).collect();
@@ -180,21 +181,21 @@ fn decode<R: Read + Seek>(
         let grid = source.grid(part)?;
         let header = &source.meta.headers[part];
         let rows = source.batch(header).div_ceil(grid.columns);
-        let mut here = Vec::with_capacity(wanted.len());
+        let mut part_channels = Vec::with_capacity(wanted.len());
         for (channel, plane) in wanted.iter().zip(&mut planes) {
             if channel.part == part {
                 reserve(plane, channel.window)?;
-                let span = Span::of(&header.channels, channel.index);
-                here.push((channel.window, span, plane));
+                let span = SampleSpan::of(&header.channels, channel.index);
+                part_channels.push((channel.window, span, plane));
             }
         }
         for top in (0..grid.rows).step_by(rows) {
             let bottom = grid.rows.min(top + rows);
             let row = |row| (0..grid.columns).map(move |column| (column, row));
-            let places: Vec<Place> = (top..bottom).flat_map(row).collect();
+            let places: Vec<BlockPosition> = (top..bottom).flat_map(row).collect();
             let blocks = source.decode(part, &grid, &places)?;
             let lines = bottom * grid.block.height();
-            let targets = here.iter_mut().collect();
+            let targets = part_channels.iter_mut().collect();
             parallel::map(source.threads, targets, |(window, span, plane)| {
                 grow(plane, window.width * window.height.min(lines));
                 for block in &blocks {
@@ -207,8 +208,8 @@ fn decode<R: Read + Seek>(
     Ok(planes)
 }
 
-/// Copies a channel's samples in a block to where they belong in an image of this width.
-fn copy(block: &UncompressedBlock, span: Span, image_width: usize, plane: &mut Plane) {
+/// Copies a channel's samples from a block to their positions in an image of this width.
+fn copy(block: &UncompressedBlock, span: SampleSpan, image_width: usize, plane: &mut Plane) {
     let (Vec2(left, top), Vec2(width, height)) =
         (block.index.pixel_position, block.index.pixel_size);
     for y in top..top + height {
@@ -229,15 +230,15 @@ fn put<T, const N: usize>(bytes: &[u8], samples: &mut [T], from: impl Fn([u8; N]
     }
 }
 
-fn empty(kind: Kind) -> Plane {
+fn empty(kind: ChannelType) -> Plane {
     match kind {
-        Kind::Half => Plane::Half(Vec::new()),
-        Kind::Float => Plane::Float(Vec::new()),
-        Kind::Uint => Plane::Uint(Vec::new()),
+        ChannelType::Half => Plane::Half(Vec::new()),
+        ChannelType::Float => Plane::Float(Vec::new()),
+        ChannelType::Uint => Plane::Uint(Vec::new()),
     }
 }
 
-/// Takes the address space for a whole plane; memory is taken as rows are filled.
+/// Reserves address space for a whole plane; memory is used as rows are filled.
 fn reserve(plane: &mut Plane, window: Window) -> Result<(), ExrError> {
     let samples = window.width * window.height;
     let reserved = match plane {

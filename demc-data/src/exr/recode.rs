@@ -1,7 +1,7 @@
-//! From the blocks of a file to those of its rewritten self, a few at a time.
+//! Conversion of a file's blocks to those of the rewritten file, in small batches.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::{Read, Seek, Write};
+use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::Path;
 
 use ::exr::block::UncompressedBlock;
@@ -16,27 +16,30 @@ use ::exr::meta::{BlockDescription, Headers};
 use ::exr::prelude::{Compression, Vec2};
 use half::f16;
 
-use super::blocks::{Grid, Place, Source};
-use super::decode::Span;
-use super::plan::{Origin, Plan};
+use super::blocks::{BlockGrid, BlockPosition, BlockReader};
+use super::decode::SampleSpan;
+use super::plan::{ChannelOrigin, RewritePlan};
 use super::write::{io_error, saturated_half};
-use super::{ExrFile, attributes, guarded, zip};
+use super::{ExrFile, guarded, invalid, zip};
 use crate::parallel;
 use crate::{Error, file};
 
-/// Writes what was planned; returns how many samples of the colour are beyond half's range.
+/// Headers begin after the magic number and the version, in bytes.
+const HEADERS_START: u64 = 8;
+
+/// Writes the planned file. Returns the number of colour samples beyond the range of half.
 ///
 /// # Shapes
 /// `color_hdr` is `[3, height, width]`.
 pub(super) fn recode<R: Read + Seek>(
     file: &mut ExrFile<R>,
-    plan: &Plan,
+    plan: &RewritePlan,
     color_hdr: &[f32],
     output: &Path,
 ) -> Result<usize, Error> {
     let path = file.path().to_owned();
     let mut recoder = Recoder {
-        input: Input {
+        input: RewriteInput {
             path: &path,
             source: &mut file.source,
             error: None,
@@ -53,7 +56,7 @@ pub(super) fn recode<R: Read + Seek>(
                 Some(origins) => recoder.code(part, from.input, origins, blocks),
             })
         })
-        .and_then(|()| attributes::sort(writer, &plan.headers))
+        .and_then(|()| sort_attributes(writer, &plan.headers))
         .map_err(io_error)
     });
     match recoder.input.error {
@@ -63,24 +66,24 @@ pub(super) fn recode<R: Read + Seek>(
 }
 
 struct Recoder<'a, R> {
-    input: Input<'a, R>,
-    /// Of the output.
+    input: RewriteInput<'a, R>,
+    /// Headers of the output.
     headers: &'a Headers,
     color_hdr: &'a [f32],
     clamped: usize,
 }
 
-/// The input, and what was wrong with it: within the writer that would pass for an error of the output.
-struct Input<'a, R> {
+/// The input, and its error: inside the writer, that would be mistaken for an error of the output.
+struct RewriteInput<'a, R> {
     path: &'a Path,
-    source: &'a mut Source<R>,
+    source: &'a mut BlockReader<R>,
     error: Option<Error>,
 }
 
-impl<R> Input<'_, R> {
+impl<R> RewriteInput<'_, R> {
     fn get<T>(
         &mut self,
-        read: impl FnOnce(&mut Source<R>) -> Result<T, ExrError>,
+        read: impl FnOnce(&mut BlockReader<R>) -> Result<T, ExrError>,
     ) -> Result<T, ExrError> {
         guarded(self.path, || read(self.source)).map_err(|error| {
             self.error = Some(error);
@@ -90,7 +93,7 @@ impl<R> Input<'_, R> {
 }
 
 impl<R: Read + Seek> Recoder<'_, R> {
-    /// Copies a part, compressed as it is.
+    /// Copies a part without decompressing it.
     fn copy<W: Write + Seek>(
         &mut self,
         part: usize,
@@ -114,22 +117,22 @@ impl<R: Read + Seek> Recoder<'_, R> {
         Ok(())
     }
 
-    /// Codes a part anew.
+    /// Encodes a part again.
     fn code<W: Write + Seek>(
         &mut self,
         part: usize,
         from: usize,
-        origins: &[Origin],
+        origins: &[ChannelOrigin],
         blocks: &mut ChunkWriter<W>,
     ) -> UnitResult {
         let header = &self.headers[part];
         let grid = self.input.get(|source| source.grid(from))?;
         let source = &self.input.source;
         let (batch, threads) = (source.batch(header), source.threads);
-        let mut carried = Carried::new(from, grid, &source.meta.headers[from], origins);
+        let mut carried = CarriedChannels::new(from, grid, &source.meta.headers[from], origins);
         for batch in targets(header)?.chunks(batch) {
             carried.fetch(&mut self.input, batch)?;
-            let code = |target: &Target| -> Result<(usize, Chunk, usize), ExrError> {
+            let code = |target: &OutputBlock| -> Result<(usize, Chunk, usize), ExrError> {
                 let (data, clamped) = assemble(header, target, self.color_hdr, &carried);
                 let chunk = compress(part, header, target, data)?;
                 Ok((target.index, chunk, clamped))
@@ -145,21 +148,21 @@ impl<R: Read + Seek> Recoder<'_, R> {
 }
 
 /// A block of the output.
-struct Target {
-    /// Its place in the table of blocks.
+struct OutputBlock {
+    /// Its index in the table of blocks.
     index: usize,
     tile: TileCoordinates,
-    /// Its pixels.
+    /// Its position and size in pixels.
     corner: Vec2<usize>,
     size: Vec2<usize>,
 }
 
-/// The blocks of a part, in the order of the file.
-fn targets(header: &Header) -> Result<Vec<Target>, ExrError> {
+/// The blocks of a part, in file order.
+fn targets(header: &Header) -> Result<Vec<OutputBlock>, ExrError> {
     let blocks = header.enumerate_ordered_blocks();
     let targets = blocks.map(|(index, tile)| {
         let area = header.get_absolute_block_pixel_coordinates(tile.location)?;
-        Ok(Target {
+        Ok(OutputBlock {
             index,
             tile: tile.location,
             corner: area.position.to_usize("block position")?,
@@ -169,12 +172,12 @@ fn targets(header: &Header) -> Result<Vec<Target>, ExrError> {
     targets.collect()
 }
 
-/// The samples of a block of the output, and how many of the colour are beyond half's range.
+/// The samples of an output block, and the number of colour samples beyond the range of half.
 fn assemble(
     header: &Header,
-    target: &Target,
+    target: &OutputBlock,
     color_hdr: &[f32],
-    carried: &Carried,
+    carried: &CarriedChannels,
 ) -> (Vec<u8>, usize) {
     let Vec2(image_width, image_height) = header.layer_size;
     let (Vec2(x, top), Vec2(width, height)) = (target.corner, target.size);
@@ -184,12 +187,12 @@ fn assemble(
         let block = carried.blocks.get(&carried.grid.place(Vec2(x, y)));
         for (channel, content) in header.channels.list.iter().zip(&carried.contents) {
             match content {
-                Content::Color(plane) => {
+                ChannelContent::Color(plane) => {
                     let start = (plane * image_height + y) * image_width + x;
                     let line = &color_hdr[start..start + width];
                     clamped += put(line, channel.sample_type, &mut data);
                 }
-                Content::Carried(span) => {
+                ChannelContent::Carried(span) => {
                     let block = block.expect("fetched before");
                     data.extend_from_slice(span.line(block, y));
                 }
@@ -203,11 +206,11 @@ fn assemble(
 fn compress(
     part: usize,
     header: &Header,
-    target: &Target,
+    target: &OutputBlock,
     data: Vec<u8>,
 ) -> Result<Chunk, ExrError> {
     let pixels = header.get_absolute_block_pixel_coordinates(target.tile)?;
-    // The format's byte order is this machine's, but for a few.
+    // The byte order of the format is that of most machines.
     let ours = cfg!(target_endian = "little");
     let compressed_pixels_le = match header.compression {
         Compression::ZIP1 | Compression::ZIP16 if ours => zip::compress(data)?,
@@ -228,28 +231,28 @@ fn compress(
     })
 }
 
-/// What a channel of the output has.
-enum Content {
+/// The content of a channel of the output.
+enum ChannelContent {
     /// A plane of the denoised colour.
     Color(usize),
-    /// A channel of the input's blocks.
-    Carried(Span),
+    /// A channel of the input.
+    Carried(SampleSpan),
 }
 
-/// The channels of a part, and those of the input's blocks that the batch at hand needs.
-struct Carried {
+/// The channels of a part, and the blocks of the input that the current batch needs.
+struct CarriedChannels {
     part: usize,
-    grid: Grid,
+    grid: BlockGrid,
     /// In the order of the output's channels.
-    contents: Vec<Content>,
-    blocks: BTreeMap<Place, UncompressedBlock>,
+    contents: Vec<ChannelContent>,
+    blocks: BTreeMap<BlockPosition, UncompressedBlock>,
 }
 
-impl Carried {
-    fn new(part: usize, grid: Grid, input: &Header, origins: &[Origin]) -> Self {
-        let content = |origin: &Origin| match origin.plane {
-            Some(plane) => Content::Color(plane),
-            None => Content::Carried(Span::of(&input.channels, origin.index)),
+impl CarriedChannels {
+    fn new(part: usize, grid: BlockGrid, input: &Header, origins: &[ChannelOrigin]) -> Self {
+        let content = |origin: &ChannelOrigin| match origin.plane {
+            Some(plane) => ChannelContent::Color(plane),
+            None => ChannelContent::Carried(SampleSpan::of(&input.channels, origin.index)),
         };
         Self {
             part,
@@ -259,13 +262,14 @@ impl Carried {
         }
     }
 
-    /// Decodes the blocks that hold pixels of these targets, but for those at hand.
+    /// Decodes the blocks that hold pixels of these output blocks, except for blocks already
+    /// decoded.
     fn fetch<R: Read + Seek>(
         &mut self,
-        input: &mut Input<'_, R>,
-        targets: &[Target],
+        input: &mut RewriteInput<'_, R>,
+        targets: &[OutputBlock],
     ) -> UnitResult {
-        let carries = |content: &Content| matches!(content, Content::Carried(_));
+        let carries = |content: &ChannelContent| matches!(content, ChannelContent::Carried(_));
         if !self.contents.iter().any(carries) {
             return Ok(());
         }
@@ -274,9 +278,9 @@ impl Carried {
             let (_, last) = self.grid.place(target.corner + target.size - Vec2(1, 1));
             (first..=last).map(move |row| (column, row))
         });
-        let places: BTreeSet<Place> = places.collect();
+        let places: BTreeSet<BlockPosition> = places.collect();
         self.blocks.retain(|place, _| places.contains(place));
-        let missing: Vec<Place> = places
+        let missing: Vec<BlockPosition> = places
             .into_iter()
             .filter(|place| !self.blocks.contains_key(place))
             .collect();
@@ -286,7 +290,8 @@ impl Carried {
     }
 }
 
-/// Appends a line of colour as samples of this kind; returns how many are beyond its range.
+/// Appends a line of colour as samples of this type. Returns the number of samples beyond its
+/// range.
 fn put(line: &[f32], kind: SampleType, data: &mut Vec<u8>) -> usize {
     match kind {
         SampleType::F16 => {
@@ -300,4 +305,44 @@ fn put(line: &[f32], kind: SampleType, data: &mut Vec<u8>) -> usize {
             0
         }
     }
+}
+
+/// Writes the headers of a finished file again, with attributes sorted by name, as OpenEXR's own
+/// library does. The `exr` crate writes unknown attributes in the random order of a hash map, so
+/// equal images would give different bytes. The length does not change.
+fn sort_attributes<W: Write + Seek>(writer: &mut W, headers: &Headers) -> Result<(), ExrError> {
+    writer.seek(SeekFrom::Start(HEADERS_START))?;
+    for header in headers {
+        writer.write_all(&sorted(header)?)?;
+    }
+    writer.seek(SeekFrom::End(0))?;
+    Ok(())
+}
+
+fn sorted(header: &Header) -> Result<Vec<u8>, ExrError> {
+    let mut bytes = Vec::new();
+    header.write(&mut bytes)?;
+    // Without the terminating zero.
+    let mut rest = &bytes[..bytes.len() - 1];
+    let mut attributes = Vec::new();
+    while !rest.is_empty() {
+        let length = length(rest).filter(|&length| length <= rest.len());
+        let length = length.ok_or_else(|| invalid("an attribute cannot be written".to_owned()))?;
+        let (attribute, others) = rest.split_at(length);
+        attributes.push(attribute);
+        rest = others;
+    }
+    attributes.sort_unstable();
+    let mut sorted = attributes.concat();
+    sorted.push(0);
+    Ok(sorted)
+}
+
+/// The length of the first attribute: name, zero, type, zero, size of the value in four bytes,
+/// value.
+fn length(bytes: &[u8]) -> Option<usize> {
+    let mut zeros = (0..bytes.len()).filter(|&i| bytes[i] == 0);
+    let start = zeros.nth(1)? + 1;
+    let size = bytes.get(start..start + 4)?.try_into().ok()?;
+    Some(start + 4 + usize::try_from(i32::from_le_bytes(size)).ok()?)
 }

@@ -1,4 +1,4 @@
-//! Three channels and nothing else.
+//! Writes files with only three channels.
 
 use std::io;
 use std::path::Path;
@@ -14,14 +14,15 @@ use crate::{Error, file};
 
 /// The sample type of a written image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Precision {
-    /// 16 bits; values beyond its range (65504) are written as the largest.
+pub enum SamplePrecision {
+    /// 16 bits; values beyond its range (65504) are clamped.
     Half,
     /// 32 bits.
     Float,
 }
 
-/// Writes linear radiance as an EXR file with channels `R G B`, ZIP-compressed, whole or not at all.
+/// Writes linear radiance as a ZIP-compressed EXR file with channels `R G B`. The file is complete
+/// or absent.
 ///
 /// # Shapes
 /// `rgb` is `[3, height, width]`.
@@ -36,7 +37,7 @@ pub fn write_rgb(
     width: usize,
     height: usize,
     rgb: &[f32],
-    precision: Precision,
+    precision: SamplePrecision,
 ) -> Result<(), Error> {
     assert_eq!(
         rgb.len(),
@@ -48,10 +49,10 @@ pub fn write_rgb(
         .zip(rgb.chunks_exact(width * height))
         .map(|(name, plane)| {
             let samples = match precision {
-                Precision::Half => {
+                SamplePrecision::Half => {
                     FlatSamples::F16(plane.iter().map(|&v| saturated_half(v)).collect())
                 }
-                Precision::Float => FlatSamples::F32(plane.to_vec()),
+                SamplePrecision::Float => FlatSamples::F32(plane.to_vec()),
             };
             AnyChannel::new(name, samples)
         });
@@ -82,7 +83,7 @@ pub(super) fn io_error(error: ExrError) -> io::Error {
     }
 }
 
-/// The nearest half, the largest in place of infinity.
+/// The nearest half; values beyond its range become the largest half.
 pub(super) fn saturated_half(value: f32) -> f16 {
     f16::from_f32(value.clamp(f16::MIN.to_f32(), f16::MAX.to_f32()))
 }

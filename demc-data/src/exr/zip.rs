@@ -1,34 +1,37 @@
-//! The ZIP compression of OpenEXR: the even bytes of a block, then the odd ones, as differences, deflated.
+//! OpenEXR's ZIP compression: the even bytes of a block, then the odd bytes, as differences,
+//! deflated.
 //!
-//! Only the encoder: `exr` decodes as fast as need be, but its deflate takes two thirds of the time of writing.
+//! Only the encoder. The decoder of `exr` is fast enough, but its encoder takes two thirds of the
+//! writing time.
 
 use ::exr::error::Error as ExrError;
 use flate2::{Compress, Compression, FlushCompress, Status};
 
-use super::blocks::invalid;
+use super::invalid;
 
-/// Of deflate (ours: 2.5 times as fast as level 4, for files 15 to 20 % larger).
+/// Deflate level (ours: 2.5 times as fast as level 4, with files 15 to 20 % larger).
 const LEVEL: u32 = 1;
 
-/// Compresses the samples of a block; the samples themselves where that is not smaller, which is how the format tells.
+/// Compresses the samples of a block. Returns the samples themselves if compression does not make
+/// them smaller, as the format requires.
 pub(super) fn compress(samples: Vec<u8>) -> Result<Vec<u8>, ExrError> {
     let differences = differences(&samples);
     let mut deflated = Vec::with_capacity(samples.len());
     let status = Compress::new(Compression::new(LEVEL), true)
         .compress_vec(&differences, &mut deflated, FlushCompress::Finish)
         .map_err(|error| invalid(error.to_string()))?;
-    // Without room to end in, it is not smaller.
+    // If the output buffer is too small, the result is not smaller.
     let smaller = status == Status::StreamEnd && deflated.len() < samples.len();
     Ok(if smaller { deflated } else { samples })
 }
 
-/// Each byte less the one before plus 128, where all even bytes come before all odd ones.
+/// Differences of consecutive bytes plus 128, with all even bytes before all odd ones.
 fn differences(samples: &[u8]) -> Vec<u8> {
     let mut bytes = vec![0; samples.len()];
     let (even, odd) = bytes.split_at_mut(samples.len().div_ceil(2));
     let (pairs, rest) = samples.as_chunks::<2>();
     for ((even, odd), &pair) in even.iter_mut().zip(odd).zip(pairs) {
-        // As one number: the compiler then takes many at once.
+        // Handled as one number, which the compiler vectorises.
         let pair = u16::from_le_bytes(pair);
         (*even, *odd) = (pair as u8, (pair >> 8) as u8);
     }
@@ -50,7 +53,7 @@ mod tests {
 
     use super::*;
 
-    /// The way back, as the format's documentation has it.
+    /// The inverse, as in the documentation of the format.
     fn decompress(bytes: &[u8]) -> Vec<u8> {
         let mut separated = Vec::new();
         let read = ZlibDecoder::new(bytes).read_to_end(&mut separated);
@@ -69,7 +72,7 @@ mod tests {
 
     #[test]
     fn blocks_of_all_lengths_come_back() {
-        // Few values in long runs, so that even the shortest shrink.
+        // Few values in long runs, so that even the shortest inputs shrink.
         for length in (64..160).chain([4095, 65_537]) {
             let samples: Vec<u8> = (0..length as u32)
                 .map(|i| (i * i / 251) as u8 / 64 * 60 + 3)
@@ -81,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_shrink_stays_as_it_is() {
+    fn incompressible_samples_stay_as_they_are() {
         let noise = |i: u32| (i.wrapping_mul(2_654_435_761) >> 24) as u8 ^ (i * i % 251) as u8;
         for samples in [vec![7], vec![1, 2, 3], (0..300).map(noise).collect()] {
             assert_eq!(compress(samples.clone()).expect("memory suffices"), samples);

@@ -23,7 +23,7 @@ pub fn small() -> DataConfig {
     }
 }
 
-/// What they are cut from.
+/// The source of these batches.
 pub fn source(config: &DataConfig) -> Arc<PatchSource> {
     let source = PatchSource::new(config, train_scenes(), layout(), identity(), 7);
     Arc::new(source.expect("the sample is large enough"))

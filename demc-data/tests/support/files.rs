@@ -12,7 +12,8 @@ use exr::meta::header::Header;
 use exr::meta::{BlockDescription, Headers};
 use exr::prelude::*;
 
-/// The channels of the `demc-exr` layout with their types: position and mask are `float`, the rest `half`.
+/// The channels of the `demc-exr` layout with their types: position and mask are `float`, the rest
+/// `half`.
 pub fn scene_kinds() -> Vec<(String, SampleType)> {
     let channels = super::scene_channels(1, 1).into_iter();
     let kinds = channels.map(|(name, _)| {
@@ -73,14 +74,14 @@ pub fn tiled(header: Header, level_mode: LevelMode, rounding_mode: RoundingMode)
     )
 }
 
-/// The same part elsewhere in a larger picture.
+/// The same part at another position in a larger picture.
 pub fn placed(header: Header, corner: (i32, i32), display: IntegerBounds) -> Header {
     header
         .with_position(Vec2(corner.0, corner.1))
         .with_display_window(display)
 }
 
-/// A sample that tells part, channel and pixel apart, all exact in half.
+/// A sample that identifies part, channel and pixel; all are exact in half.
 pub fn sample(part: usize, channel: usize, (x, y): (usize, usize)) -> f32 {
     (part * 512 + channel * 16) as f32 + ((x * 7 + y * 13) % 64) as f32 / 4.0
 }

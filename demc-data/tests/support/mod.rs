@@ -29,7 +29,7 @@ pub fn identity() -> Normalizer {
     };
     Normalizer {
         gamma: 2.2,
-        demodulate: 0.0,
+        albedo_demodulation_epsilon: None,
         features,
         flat_color: [0.4; 3],
     }

@@ -1,4 +1,4 @@
-//! Inputs to rewrite, and checks of what came out.
+//! Inputs for rewriting, and checks of the output.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ use super::layout;
 pub const SIZE: (usize, usize) = (37, 45);
 pub const PIXELS: usize = SIZE.0 * SIZE.1;
 
-/// A denoised colour that half holds exactly.
+/// A denoised colour that is exact in half.
 pub fn color(pixels: usize) -> Vec<f32> {
     (0..3 * pixels).map(|i| (i % 2039) as f32 / 8.0).collect()
 }
@@ -39,7 +39,8 @@ pub fn planes(path: &Path) -> Vec<(Channel, Plane)> {
     channels.clone().into_iter().zip(planes).collect()
 }
 
-/// Checks that `output` has the channels of `input`, of the same types and bits, but for its colour.
+/// Checks that `output` has the channels of `input`, with the same types and bits, except for its
+/// colour.
 pub fn assert_carried(input: &Path, output: &Path, what: &str) {
     let (before, after) = (planes(input), planes(output));
     assert_eq!(before.len(), after.len(), "{what}");
@@ -82,7 +83,7 @@ pub fn method(compression: Compression) -> Method {
     }
 }
 
-/// Attributes of every sort: standard, shared by parts, of unknown types.
+/// Attributes of every kind: standard ones, those shared by all parts, and unknown types.
 pub fn with_attributes(mut header: Header) -> Header {
     let own = &mut header.own_attributes;
     own.software_name = Some("a renderer 1.0".into());

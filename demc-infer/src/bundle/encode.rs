@@ -1,98 +1,89 @@
-//! Weights to the bytes of a safetensors file: names and precision.
+//! Encodes weights as a safetensors file: names and precision.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
-use demc_model::Weight;
+use demc_model::{ModelConfig, Role, Weight, WeightSpec};
 use half::f16;
 use half::slice::HalfFloatSliceExt;
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
 
-use super::tensors::{Encoded, f32_bytes, serialize};
+use super::tensors::{EncodedTensor, f32_bytes, serialize};
 use super::{BundleError, BundleMeta};
 
-/// The header's metadata key that makes a safetensors file a bundle.
+/// The metadata key in the header that identifies a bundle.
 pub(super) const KEY: &str = "demc";
 
-/// Whose names the tensors have. They differ for batch normalisation only, and both load.
+/// The naming scheme of the tensors. The schemes differ for batch normalisation only, and both
+/// load.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Names {
-    /// The fields of the Burn modules: `norm.gamma`, `norm.beta`.
+    /// Field names of the Burn modules: `norm.gamma`, `norm.beta`.
     Burn,
-    /// What PyTorch's `load_state_dict` expects: `norm.weight`, `norm.bias`.
+    /// Names that PyTorch's `load_state_dict` expects: `norm.weight`, `norm.bias`.
     Torch,
 }
 
-/// Endings of names, Burn's and PyTorch's.
-const ENDINGS: [(&str, &str); 2] = [
-    (".norm.gamma", ".norm.weight"),
-    (".norm.beta", ".norm.bias"),
-];
-
 impl Names {
-    /// The name in a file of the tensor that Burn calls `name`.
-    pub fn from_burn(self, name: &str) -> String {
-        match self {
-            Names::Burn => name.into(),
-            Names::Torch => with_ending(name, ENDINGS),
+    /// The name of a tensor in a file. PyTorch calls the scale and shift of a batch normalisation
+    /// `weight` and `bias`.
+    pub fn in_file(self, spec: &WeightSpec) -> String {
+        match (self, spec.role) {
+            (Names::Torch, Role::NormScale) => format!("{}.weight", spec.layer()),
+            (Names::Torch, Role::NormShift) => format!("{}.bias", spec.layer()),
+            _ => spec.name.clone(),
         }
     }
 
-    /// Burn's name of the tensor that a file calls `name`: the inverse of [`from_burn`](Self::from_burn).
-    pub fn to_burn(self, name: &str) -> String {
-        match self {
-            Names::Burn => name.into(),
-            Names::Torch => with_ending(name, ENDINGS.map(|(burn, torch)| (torch, burn))),
-        }
+    /// A network's tensors, keyed by their names in a file.
+    pub fn specs_in_file(self, model: &ModelConfig) -> BTreeMap<String, WeightSpec> {
+        let specs = model.weight_specs().into_iter();
+        specs.map(|spec| (self.in_file(&spec), spec)).collect()
     }
 }
 
-fn with_ending(name: &str, endings: [(&str, &str); 2]) -> String {
-    endings
-        .into_iter()
-        .find_map(|(from, to)| Some(format!("{}{to}", name.strip_suffix(from)?)))
-        .unwrap_or_else(|| name.into())
-}
-
-/// The type of the weights in a file. Batch normalisation stays f32: its running variance spans many decades.
+/// The type of the weights in a file. Batch normalisation stays f32, because its running variance
+/// spans many orders of magnitude.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
-    /// 32 bits: what training uses.
+    /// 32 bits, as in training.
     F32,
     /// 16 bits: half the size, rounded to 11 significant bits.
     F16,
 }
 
 impl Precision {
-    /// The type in the file of the tensor that Burn calls `name`.
-    fn dtype(self, name: &str) -> Dtype {
+    /// The type of a tensor in a file.
+    fn dtype(self, role: Role) -> Dtype {
         match self {
-            Precision::F16 if !name.contains(".norm.") => Dtype::F16,
+            Precision::F16 if !role.is_norm() => Dtype::F16,
             _ => Dtype::F32,
         }
     }
 
-    /// Whether `theirs` is `ours` after a trip through a file of this precision: bit for bit in f32, within half a
-    /// unit in the last place (2^-11, or 2^-25 among the subnormals) in f16.
-    pub(super) fn keeps(self, ours: &Weight, theirs: &Weight) -> bool {
-        let equal = |a: f32, b: f32| match self.dtype(&ours.name) {
+    /// Whether `read` equals `written` after storage with this precision.
+    ///
+    /// f32 is compared bit for bit, f16 within half a unit in the last place (2^-11, or 2^-25 for
+    /// subnormals).
+    pub(super) fn preserves(self, role: Role, written: &Weight, read: &Weight) -> bool {
+        let equal = |a: f32, b: f32| match self.dtype(role) {
             Dtype::F16 => (a - b).abs() <= (a.abs() * 2f32.powi(-11)).max(2f32.powi(-25)),
             _ => a.to_bits() == b.to_bits(),
         };
-        ours.name == theirs.name
-            && ours.shape == theirs.shape
-            && ours.data.len() == theirs.data.len()
-            && ours
+        written.name == read.name
+            && written.shape == read.shape
+            && written.data.len() == read.data.len()
+            && written
                 .data
                 .iter()
-                .zip(&theirs.data)
+                .zip(&read.data)
                 .all(|(&a, &b)| equal(a, b))
     }
 }
 
-/// The header entry: the metadata with the names' style beside it.
+/// The header entry: the metadata and the naming scheme.
 #[derive(Serialize)]
 struct Header<'a> {
     #[serde(flatten)]
@@ -100,7 +91,8 @@ struct Header<'a> {
     names: Names,
 }
 
-/// The bytes of a bundle file. safetensors sorts the tensors by type and name, so equal inputs give equal bytes.
+/// The bytes of a bundle file. safetensors sorts tensors by type and name, so equal inputs give
+/// equal bytes.
 ///
 /// # Errors
 /// A weight beyond f16's range.
@@ -113,10 +105,11 @@ pub(super) fn encode(
     let header = serde_json::to_string(&Header { meta, names });
     let header = header.map_err(|error| BundleError::Encode(error.to_string()))?;
     let mut tensors = Vec::with_capacity(weights.len());
-    for weight in weights {
-        let dtype = precision.dtype(&weight.name);
-        tensors.push(Encoded {
-            name: names.from_burn(&weight.name),
+    for (weight, spec) in weights.into_iter().zip(meta.model.weight_specs()) {
+        debug_assert_eq!(weight.name, spec.name);
+        let dtype = precision.dtype(spec.role);
+        tensors.push(EncodedTensor {
+            name: names.in_file(&spec),
             dtype,
             bytes: match dtype {
                 Dtype::F16 => f16_bytes(&weight)?,
@@ -146,7 +139,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn torch_names_differ_in_batch_normalisation_only_and_go_back() {
+    fn pytorch_names_differ_for_batch_normalisation_only() {
+        let specs = super::super::testing::bundle(demc_model::Variant::Demc)
+            .meta
+            .model
+            .weight_specs();
+        let name_of = |burn: &str| {
+            let spec = specs.iter().find(|spec| spec.name == burn).expect(burn);
+            assert_eq!(Names::Burn.in_file(spec), burn);
+            Names::Torch.in_file(spec)
+        };
         for (burn, torch) in [
             ("fusion.blocks.1.norm.gamma", "fusion.blocks.1.norm.weight"),
             ("latent.norm.beta", "latent.norm.bias"),
@@ -157,14 +159,12 @@ mod tests {
                 "decoder.levels.0.deconv.bias",
             ),
         ] {
-            assert_eq!(Names::Torch.from_burn(burn), torch);
-            assert_eq!(Names::Torch.to_burn(torch), burn);
-            assert_eq!(Names::Burn.from_burn(burn), burn);
+            assert_eq!(name_of(burn), torch);
         }
     }
 
     #[test]
-    fn f16_keeps_what_it_rounds_and_nothing_worse() {
+    fn f16_preserves_values_up_to_rounding() {
         let weight = |value: f32| Weight {
             name: "decoder.head.bias".into(),
             shape: vec![1],
@@ -173,12 +173,12 @@ mod tests {
         for value in [0.0, 0.1, -3.3, 1e-7, 6e-8, 65504.0] {
             let rounded = f16::from_f32(value).to_f32();
             assert!(
-                Precision::F16.keeps(&weight(value), &weight(rounded)),
+                Precision::F16.preserves(Role::Bias, &weight(value), &weight(rounded)),
                 "{value}"
             );
         }
-        assert!(!Precision::F16.keeps(&weight(1.0), &weight(1.001)));
-        assert!(!Precision::F32.keeps(&weight(0.0), &weight(-0.0)));
+        assert!(!Precision::F16.preserves(Role::Bias, &weight(1.0), &weight(1.001)));
+        assert!(!Precision::F32.preserves(Role::Bias, &weight(0.0), &weight(-0.0)));
     }
 
     #[test]

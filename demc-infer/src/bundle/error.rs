@@ -1,4 +1,4 @@
-//! What can go wrong with bundle files; each message is one line that begins with the path.
+//! Errors of bundle files. Each message is one line that starts with the path.
 
 use std::path::PathBuf;
 
@@ -6,24 +6,24 @@ use demc_model::WeightsError;
 
 use super::FORMAT;
 
-/// Why a bundle could not be written or read.
+/// Why a bundle cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum BundleError {
-    /// The file or directory could not be read.
+    /// The file or directory cannot be read.
     #[error("cannot read {}", path.display())]
     Read {
         /// The file or directory.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         source: std::io::Error,
     },
-    /// The file could not be written.
+    /// The file cannot be written.
     #[error(transparent)]
     Write(#[from] demc_data::Error),
     /// A directory that is neither a run nor a checkpoint.
     #[error(
-        "{}: neither a run directory nor a checkpoint: no best.safetensors, latest or model.safetensors in it",
+        "{}: neither a run directory nor a checkpoint: it has no best.safetensors, latest or model.safetensors",
         path.display()
     )]
     NoModel {
@@ -35,10 +35,10 @@ pub enum BundleError {
     Damaged {
         /// The file.
         path: PathBuf,
-        /// What the decoder said.
+        /// The decoder's message.
         detail: String,
     },
-    /// A safetensors file of somebody else.
+    /// A safetensors file from another program.
     #[error(
         "{}: a safetensors file, but no DEMC bundle: its header has no `demc` entry with statistics and layout",
         path.display()
@@ -47,7 +47,7 @@ pub enum BundleError {
         /// The file.
         path: PathBuf,
     },
-    /// A bundle of another version of this program.
+    /// A bundle from another version of this program.
     #[error("{}: bundle format {found}; this build reads format {FORMAT}", path.display())]
     Format {
         /// The file.
@@ -55,41 +55,41 @@ pub enum BundleError {
         /// Its format.
         found: u64,
     },
-    /// The header's JSON does not say what it should.
+    /// The header's JSON is invalid.
     #[error("{}: header entry `demc`: {detail}", path.display())]
     Header {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The problems.
         detail: String,
     },
-    /// A tensor whose values are of no use: another type than f32 or f16, NaN or infinity.
+    /// A tensor has a type other than f32 and f16, or holds NaN or infinity.
     #[error("{}: tensor {name}: {detail}", path.display())]
     Tensor {
         /// The file.
         path: PathBuf,
         /// The tensor.
         name: String,
-        /// What is wrong.
+        /// The problem.
         detail: String,
     },
-    /// The tensors do not make the network that the header describes.
+    /// The tensors do not match the network that the header describes.
     #[error("{}", path.display())]
     Weights {
         /// The file.
         path: PathBuf,
-        /// The first tensor that does not fit.
+        /// The first tensor that does not match.
         source: WeightsError,
     },
-    /// Tensors that do not make the network that they are said to be of; every one of them.
+    /// Imported tensors do not match the network.
     #[error("{}: {problems}", path.display())]
     Import {
         /// The file.
         path: PathBuf,
-        /// What is missing, unknown, of another shape or type, or of no use.
+        /// All tensors with a problem, by kind.
         problems: String,
     },
-    /// A weight beyond f16's largest value.
+    /// A weight beyond f16's range.
     #[error("tensor {name}: {value} does not fit into f16; export with f32")]
     Overflow {
         /// The tensor.
@@ -97,23 +97,23 @@ pub enum BundleError {
         /// The value.
         value: f32,
     },
-    /// A network beyond what one ONNX file can hold.
+    /// The network is too large for one ONNX file.
     #[error(
-        "an ONNX file of {bytes} bytes: protobuf's limit is 2 GiB; export with f16, or a narrower network"
+        "the ONNX file would have {bytes} bytes, but protobuf's limit is 2 GiB; export with f16, or use a narrower network"
     )]
     TooLargeForOnnx {
-        /// What it would need.
+        /// Size of the file.
         bytes: u64,
     },
-    /// What was read back after writing is not what was written.
+    /// The file that was read back differs from what was written.
     #[error("{}: read back after writing, but {what} differs: do not use this file", path.display())]
     ReadBack {
         /// The file.
         path: PathBuf,
-        /// What differs.
+        /// The part that differs.
         what: String,
     },
-    /// The safetensors writer refused; a programmer's error.
+    /// The safetensors writer failed; a programmer's error.
     #[error("cannot encode the weights: {0}")]
     Encode(String),
 }

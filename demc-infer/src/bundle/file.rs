@@ -1,4 +1,4 @@
-//! A bundle file taken apart: header and tensors, before they are a network.
+//! Reads a bundle file: header and tensors, without building the network.
 
 use std::fs::{self, File};
 use std::io::{self, Read};
@@ -14,23 +14,23 @@ use super::encode::KEY;
 use super::tensors::{one_line, values};
 use super::{BundleError, BundleMeta, FORMAT, Names, Precision, locate};
 
-/// Longest header that is read; ours: that of the widest network is 20 kB.
-const LONGEST_HEADER: u64 = 4 << 20;
-/// Bytes before the header: its length.
+/// Longest accepted header in bytes (ours: the widest network's has 20 kB).
+const MAX_HEADER: u64 = 4 << 20;
+/// Size of the field before the header that holds its length, in bytes.
 const LENGTH: usize = 8;
 
-/// What a bundle file holds, checked as far as that goes without building the network.
+/// The contents of a bundle file, validated as far as possible without building the network.
 #[derive(Debug, Clone)]
 pub struct BundleFile {
-    /// The file itself, where a directory was given.
+    /// The file, also if a directory was given.
     pub path: PathBuf,
-    /// Everything but the weights.
+    /// Everything except the weights.
     pub meta: BundleMeta,
-    /// The style of the tensor names in the file.
+    /// The naming scheme in the file.
     pub names: Names,
-    /// `F16` if any tensor is.
+    /// `F16` if any tensor has that type.
     pub precision: Precision,
-    /// The tensors under Burn's names, as f32, sorted by name.
+    /// The tensors with Burn's names, as f32, sorted by name.
     pub weights: Vec<Weight>,
 }
 
@@ -38,23 +38,25 @@ impl BundleFile {
     /// Reads a run directory, a checkpoint directory or a bundle file; see [`super::Bundle::load`].
     ///
     /// # Errors
-    /// A file that cannot be read, is cut short, is no bundle or one of another format; a tensor of another type
-    /// than f32 and f16 or with NaN or infinity in it; statistics that nothing can be divided by.
+    /// - The file cannot be read, is cut short, is no bundle, or has another format.
+    /// - A tensor has a type other than f32 and f16, or holds NaN or infinity.
+    /// - A standard deviation is zero, or another entry of the header is invalid.
     pub fn read(path: &Path) -> Result<Self, BundleError> {
         let path = locate::locate(path)?;
         let bytes = read(&path)?;
         Self::parse(path, &bytes)
     }
 
-    /// Takes the bytes of a bundle file apart; `path` is what errors call it.
+    /// Parses the bytes of a bundle file. Errors call it `path`.
     ///
     /// # Errors
-    /// As [`read`](Self::read), but for reading.
+    /// As [`read`](Self::read), except for reading.
     pub fn parse(path: PathBuf, bytes: &[u8]) -> Result<Self, BundleError> {
         let (meta, names) = parse_meta(&path, bytes)?;
         let tensors = SafeTensors::deserialize(bytes).map_err(|error| damaged(&path, &error))?;
         let mut precision = Precision::F32;
         let mut weights = Vec::with_capacity(tensors.len());
+        let mut specs = names.specs_in_file(&meta.model);
         for (name, view) in tensors.iter() {
             if view.dtype() == Dtype::F16 {
                 precision = Precision::F16;
@@ -65,7 +67,10 @@ impl BundleFile {
                 detail,
             })?;
             weights.push(Weight {
-                name: names.to_burn(&one_line(name)),
+                name: match specs.remove(name) {
+                    Some(spec) => spec.name,
+                    None => one_line(name),
+                },
                 shape: view.shape().to_vec(),
                 data,
             });
@@ -81,17 +86,17 @@ impl BundleFile {
     }
 }
 
-/// The bytes of a safetensors file and no more than its header claims: what else may stand at a path (a device, a disk image)
-/// can be larger than the memory.
+/// Reads a safetensors file, and no more bytes than its header announces. A path can also name a
+/// device or a disk image that is larger than the memory.
 ///
 /// # Errors
-/// A path that cannot be read; a header that is longer than any of ours.
+/// A path that cannot be read, or a header longer than [`MAX_HEADER`].
 pub(super) fn read(path: &Path) -> Result<Vec<u8>, BundleError> {
     let failed = |source| BundleError::Read {
         path: path.into(),
         source,
     };
-    // A FIFO would wait for a writer.
+    // Opening a FIFO would wait for a writer.
     if !fs::metadata(path).map_err(failed)?.is_file() {
         let source = io::Error::new(io::ErrorKind::InvalidInput, "not a regular file");
         return Err(failed(source));
@@ -105,16 +110,16 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>, BundleError> {
     let Ok(length) = <[u8; LENGTH]>::try_from(&bytes[..]).map(u64::from_le_bytes) else {
         return Ok(bytes);
     };
-    if length > LONGEST_HEADER {
+    if length > MAX_HEADER {
         return Err(BundleError::Damaged {
             path: path.into(),
             detail: format!("a header of {length} bytes"),
         });
     }
     more(&mut bytes, length).map_err(failed)?;
-    // Where the header is none, that is for the decoder to say.
+    // The decoder reports an invalid header.
     if let Ok(header) = serde_json::from_slice::<Metadata>(&bytes[LENGTH..]) {
-        // One more, so that a file that is too long is found out.
+        // One byte more, to detect a file that is too long.
         let count = (header.data_len() as u64).saturating_add(1);
         more(&mut bytes, count).map_err(failed)?;
     }
@@ -128,10 +133,10 @@ pub(super) fn damaged(path: &Path, error: &safetensors::SafeTensorError) -> Bund
     }
 }
 
-/// The metadata of a file with these bytes.
+/// The metadata of a bundle file.
 ///
 /// # Errors
-/// Bytes that are no safetensors file, or none of ours.
+/// The bytes are no safetensors file, or no bundle.
 pub(super) fn parse_meta(path: &Path, bytes: &[u8]) -> Result<(BundleMeta, Names), BundleError> {
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|error| damaged(path, &error))?;
     let entry = header.metadata().as_ref().and_then(|all| all.get(KEY));
@@ -139,7 +144,8 @@ pub(super) fn parse_meta(path: &Path, bytes: &[u8]) -> Result<(BundleMeta, Names
     parse_header(entry, path)
 }
 
-/// The metadata in the header entry. The format is looked at first: another format may have other keys.
+/// Parses the header entry. The format is checked first, because another format may have other
+/// keys.
 fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleError> {
     #[derive(Deserialize)]
     struct Version {
@@ -173,7 +179,7 @@ fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleE
     }
 }
 
-/// Statistics that would make every output NaN: worth finding before an hour of denoising.
+/// Problems in the statistics that would make every output NaN.
 fn statistics_problems(meta: &BundleMeta) -> Vec<String> {
     let normalizer = &meta.normalizer;
     let mut problems = Vec::new();
@@ -183,10 +189,11 @@ fn statistics_problems(meta: &BundleMeta) -> Vec<String> {
             normalizer.gamma
         ));
     }
-    if !(normalizer.demodulate.is_finite() && normalizer.demodulate >= 0.0) {
+    if let Some(epsilon) = normalizer.albedo_demodulation_epsilon
+        && !(epsilon.is_finite() && epsilon > 0.0)
+    {
         problems.push(format!(
-            "normalizer.demodulate: {} is not 0 or above",
-            normalizer.demodulate
+            "normalizer.demodulate: {epsilon} is not 0 or above"
         ));
     }
     let features = &normalizer.features;

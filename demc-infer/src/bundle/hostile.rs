@@ -1,5 +1,5 @@
-//! Tests with files that somebody made to do harm, and with what may stand at a path by mistake: each is refused in one line,
-//! at once, with no more memory than the file has bytes.
+//! Tests with malicious files and with paths given by mistake. Each is refused at once, in one
+//! line, with no more memory than the file has bytes.
 
 use std::fs;
 use std::path::Path;
@@ -10,13 +10,14 @@ use demc_model::Variant;
 use super::testing::bundle;
 use super::*;
 
-/// A file of a header, as it stands, and data.
+/// A file with this header and data.
 fn file(header: &[u8], data: &[u8]) -> Vec<u8> {
     let length = header.len() as u64;
     [&length.to_le_bytes()[..], header, data].concat()
 }
 
-/// The one line that loading and importing a file of these bytes say, its path taken off.
+/// The one-line error when a file with these bytes is loaded, without its path. Importing fails,
+/// too.
 fn refusal(bytes: &[u8]) -> String {
     let path = tempfile::NamedTempFile::new()
         .expect("file")
@@ -37,7 +38,7 @@ fn refusal(bytes: &[u8]) -> String {
     line(&error)
 }
 
-/// A header with the metadata of a good bundle and, as text, these tensors.
+/// A header with the metadata of a valid bundle and these tensors as JSON text.
 fn header(tensors: &str) -> Vec<u8> {
     let bytes = bundle(Variant::Demc).to_bytes(Names::Burn, Precision::F32);
     let bytes = bytes.expect("bytes");
@@ -47,7 +48,7 @@ fn header(tensors: &str) -> Vec<u8> {
     format!(r#"{{"__metadata__":{metadata}{tensors}}}"#).into_bytes()
 }
 
-/// A tensor's entry.
+/// A tensor's entry in the header.
 fn tensor(name: &str, dtype: &str, shape: &str, from: u64, to: u64) -> String {
     format!(r#","{name}":{{"dtype":"{dtype}","shape":{shape},"data_offsets":[{from},{to}]}}"#)
 }
@@ -55,7 +56,7 @@ fn tensor(name: &str, dtype: &str, shape: &str, from: u64, to: u64) -> String {
 const DAMAGED: &str = "cut short, damaged or no safetensors file: ";
 
 #[test]
-fn lengths_of_headers_that_are_none_are_refused() {
+fn invalid_header_lengths_are_refused() {
     for length in [
         1 << 22,
         (1 << 22) + 1,
@@ -123,7 +124,7 @@ fn offsets_that_overlap_leave_gaps_or_leave_the_file_are_refused() {
 }
 
 #[test]
-fn data_longer_than_the_header_says_is_refused() {
+fn data_longer_than_the_header_states_is_refused() {
     let tensors = tensor("a", "F32", "[1]", 0, 4);
     let line = refusal(&file(&header(&tensors), &[0; 5]));
     assert!(line.starts_with(DAMAGED), "{line}");
@@ -136,7 +137,7 @@ fn a_tensor_listed_twice_is_refused() {
 }
 
 #[test]
-fn headers_that_are_no_text_or_no_object_are_refused() {
+fn headers_that_are_no_json_object_are_refused() {
     let deep = "[".repeat(100_000);
     let objects = r#"{"a":"#.repeat(100_000);
     let entry = format!(r#"{{"__metadata__":{{"demc":"{deep}"}}}}"#);
@@ -161,7 +162,7 @@ fn headers_that_are_no_text_or_no_object_are_refused() {
 }
 
 #[test]
-fn entries_that_lie_are_refused() {
+fn invalid_entries_are_refused() {
     let good = String::from_utf8(header("")).expect("text");
     for (from, to, expected) in [
         (
@@ -199,7 +200,7 @@ fn entries_that_lie_are_refused() {
         (
             r#"\"normal\":[\"normal.X\""#,
             r#"\"normal\":[\"\\u001b[2J\""#,
-            r#"layout: channel "\u{1b}[2J" is no name"#,
+            r#"layout: channel "\u{1b}[2J" contains a control character"#,
         ),
         (
             r#"\"normal\":[\"normal.X\""#,
@@ -235,9 +236,9 @@ fn names_that_would_break_the_line_are_escaped() {
     assert!(refusal(&file(&header(&tensors), &[0; 8])).contains("a\\nb"));
 }
 
-/// A wide network of no weights costs nothing: the first that is missing ends it.
+/// A wide network without weights costs nothing: the first missing weight ends the load.
 #[test]
-fn a_network_is_not_built_from_nothing() {
+fn a_network_without_weights_is_not_built() {
     let good = String::from_utf8(header("")).expect("text");
     let wide = good.replacen(r#"\"width\":2"#, r#"\"width\":256"#, 1);
     let path = tempfile::NamedTempFile::new()
@@ -251,7 +252,7 @@ fn a_network_is_not_built_from_nothing() {
 }
 
 #[test]
-fn every_byte_of_a_header_may_be_wrong() {
+fn every_byte_of_a_header_may_be_damaged() {
     let bytes = bundle(Variant::ColorOnly).to_bytes(Names::Torch, Precision::F16);
     let bytes = bytes.expect("bytes");
     let length = u64::from_le_bytes(bytes[..8].try_into().expect("8 bytes")) as usize;
@@ -260,7 +261,7 @@ fn every_byte_of_a_header_may_be_wrong() {
         for change in [0x01, 0x10, 0x80, 0xff] {
             let mut bytes = bytes.clone();
             bytes[at] ^= change;
-            // Refused or not (a name of a channel may be any): it ends, in one line.
+            // Some changes are valid, such as a channel's name. An error is one line.
             let loaded = BundleFile::parse(path.into(), &bytes);
             if let Err(error) = loaded.and_then(|file| file.into_bundle(&Device::flex())) {
                 let text = error.to_string();
@@ -270,7 +271,7 @@ fn every_byte_of_a_header_may_be_wrong() {
     }
 }
 
-/// What never ends is not read to its end.
+/// An endless file is not read.
 #[cfg(unix)]
 #[test]
 fn a_device_is_no_model() {

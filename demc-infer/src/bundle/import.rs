@@ -1,9 +1,9 @@
-//! Weights that another program has trained, back into a bundle.
+//! Imports weights that were trained in another program.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use demc_model::Weight;
+use demc_model::{Role, Weight, WeightSpec};
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
 
@@ -11,25 +11,25 @@ use super::file::{damaged, parse_meta, read};
 use super::tensors::{one_line, values};
 use super::{BundleError, BundleFile, BundleMeta, Names, Precision};
 
-/// The tensors that are wrong, a list a kind.
+/// Invalid tensors by kind of problem.
 #[derive(Default)]
-struct Problems {
+struct TensorProblems {
     missing: Vec<String>,
     unknown: Vec<String>,
     misshaped: Vec<String>,
-    useless: Vec<String>,
+    unusable: Vec<String>,
     negative: Vec<String>,
 }
 
-impl Problems {
-    /// All of them in a line; `None` where there are none.
+impl TensorProblems {
+    /// All problems in one line; `None` without problems.
     fn line(self) -> Option<String> {
         let lists = [
             ("missing", self.missing),
-            ("not of this network", self.unknown),
-            ("of another shape", self.misshaped),
-            ("of no use", self.useless),
-            ("negative variance in", self.negative),
+            ("not part of this network", self.unknown),
+            ("wrong shape", self.misshaped),
+            ("unusable", self.unusable),
+            ("negative variance", self.negative),
         ];
         let parts: Vec<String> = lists
             .into_iter()
@@ -41,13 +41,16 @@ impl Problems {
 }
 
 impl BundleFile {
-    /// Reads tensors with PyTorch's names (or Burn's) from the safetensors file `path`, and says with `like` what network they
-    /// are of; without it, the file must have a header of ours.
+    /// Reads the weights of a network from the safetensors file `path`, with PyTorch's or Burn's
+    /// names.
+    ///
+    /// `like` describes the network. Without it, the file's own header must.
     ///
     /// # Errors
-    /// A file that cannot be read or is no safetensors file; [`BundleError::Foreign`] where nothing says what the weights are;
-    /// [`BundleError::Import`] with every tensor that is missing, unknown, of another shape, of another type than f32 and f16,
-    /// or not finite.
+    /// - The file cannot be read or is no safetensors file.
+    /// - [`BundleError::Foreign`]: neither `like` nor the header describes the network.
+    /// - [`BundleError::Import`]: lists every tensor that is missing, unknown, misshaped, of a type
+    ///   other than f32 and f16, or not finite.
     pub fn import(path: &Path, like: Option<BundleMeta>) -> Result<Self, BundleError> {
         let bytes = read(path)?;
         let meta = match like {
@@ -57,37 +60,39 @@ impl BundleFile {
         let file = SafeTensors::deserialize(&bytes).map_err(|error| damaged(path, &error))?;
         let mut found: BTreeMap<String, _> = file
             .iter()
-            .map(|(name, view)| (Names::Torch.to_burn(&one_line(name)), view))
+            .map(|(name, view)| (one_line(name), view))
             .collect();
-        let mut problems = Problems::default();
+        let mut problems = TensorProblems::default();
         let mut precision = Precision::F32;
         let mut weights = Vec::with_capacity(found.len());
-        for (name, shape) in meta.model.weight_shapes() {
-            let called = Names::Torch.from_burn(&name);
-            let Some(view) = found.remove(&name) else {
+        for spec in meta.model.weight_specs() {
+            let called = Names::Torch.in_file(&spec);
+            let view = found.remove(&called).or_else(|| found.remove(&spec.name));
+            let WeightSpec {
+                name, shape, role, ..
+            } = spec;
+            let Some(view) = view else {
                 problems.missing.push(called);
                 continue;
             };
             if view.shape() != shape {
                 problems
                     .misshaped
-                    .push(format!("{called} {:?} for {shape:?}", view.shape()));
+                    .push(format!("{called} {:?} instead of {shape:?}", view.shape()));
                 continue;
             }
             if view.dtype() == Dtype::F16 {
                 precision = Precision::F16;
             }
             match values(&view) {
-                Err(detail) => problems.useless.push(format!("{called} ({detail})")),
-                Ok(data) if name.ends_with(".running_var") && data.iter().any(|x| *x < 0.0) => {
+                Err(detail) => problems.unusable.push(format!("{called} ({detail})")),
+                Ok(data) if role == Role::RunningVariance && data.iter().any(|x| *x < 0.0) => {
                     problems.negative.push(called);
                 }
                 Ok(data) => weights.push(Weight { name, shape, data }),
             }
         }
-        for name in found.into_keys() {
-            problems.unknown.push(Names::Torch.from_burn(&name));
-        }
+        problems.unknown.extend(found.into_keys());
         match problems.line() {
             Some(problems) => Err(BundleError::Import {
                 path: path.into(),
@@ -116,8 +121,8 @@ mod tests {
     /// A file with PyTorch's names and no header, as `safetensors.torch.save_file` writes it.
     fn saved(bundle: &Bundle, change: impl FnOnce(&mut Vec<Weight>)) -> tempfile::TempPath {
         let mut weights = bundle.model.weights();
-        for weight in &mut weights {
-            weight.name = Names::Torch.from_burn(&weight.name);
+        for (weight, spec) in weights.iter_mut().zip(bundle.meta.model.weight_specs()) {
+            weight.name = Names::Torch.in_file(&spec);
         }
         change(&mut weights);
         let path = tempfile::NamedTempFile::new()
@@ -162,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_model_says_replaces_the_files_own_header() {
+    fn the_given_model_replaces_the_files_own_header() {
         let theirs = bundle(Variant::Demc);
         let path = tempfile::NamedTempFile::new()
             .expect("file")
@@ -178,29 +183,31 @@ mod tests {
     }
 
     #[test]
-    fn everything_that_is_wrong_is_listed_at_once() {
+    fn all_problems_are_listed_at_once() {
         let bundle = bundle(Variant::Demc);
-        let at = |weights: &mut [Weight], name: &str| {
-            weights.iter().position(|w| w.name == name).expect("there")
+        let index_of = |weights: &mut [Weight], name: &str| {
+            weights.iter().position(|w| w.name == name).expect(name)
         };
         let path = saved(&bundle, |weights| {
             for name in ["latent.norm.weight", "decoder.head.bias"] {
-                let i = at(weights, name);
+                let i = index_of(weights, name);
                 weights.remove(i);
             }
-            let i = at(weights, "latent.conv.bias");
+            let i = index_of(weights, "latent.conv.bias");
             weights[i].shape = vec![16, 1];
-            let i = at(weights, "fusion.blocks.0.conv.bias");
+            let i = index_of(weights, "fusion.blocks.0.conv.bias");
             weights[i].data[1] = f32::NAN;
-            let i = at(weights, "latent.norm.running_var");
+            let i = index_of(weights, "latent.norm.running_var");
             weights[i].data[0] = -1.0;
             weights[0].name.insert_str(0, "module.");
         });
         assert_eq!(
             error(&path, &bundle),
-            "missing: fusion.blocks.0.conv.weight, latent.norm.weight, decoder.head.bias; not of this network: \
-             module.fusion.blocks.0.conv.weight; of another shape: latent.conv.bias [16, 1] for [16]; of no use: \
-             fusion.blocks.0.conv.bias (NaN among its values); negative variance in: latent.norm.running_var"
+            "missing: fusion.blocks.0.conv.weight, latent.norm.weight, decoder.head.bias; \
+             not part of this network: module.fusion.blocks.0.conv.weight; \
+             wrong shape: latent.conv.bias [16, 1] instead of [16]; \
+             unusable: fusion.blocks.0.conv.bias (NaN among its values); \
+             negative variance: latent.norm.running_var"
         );
     }
 
@@ -214,7 +221,7 @@ mod tests {
             "{text}"
         );
         assert!(
-            text.contains("of another shape: encoders.0.levels.0.convs.0.weight"),
+            text.contains("wrong shape: encoders.0.levels.0.convs.0.weight"),
             "{text}"
         );
 
@@ -225,7 +232,7 @@ mod tests {
             .into_temp_path();
         std::fs::write(&path, bytes).expect("written");
         let text = error(&path, &ours);
-        let end = "of no use: decoder.head.bias (type I64; expected F32 or F16)";
+        let end = "unusable: decoder.head.bias (type I64; expected F32 or F16)";
         assert!(text.ends_with(end), "{text}");
     }
 }

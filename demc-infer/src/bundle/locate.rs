@@ -1,13 +1,13 @@
-//! From what a user calls a model to the file: a run directory, a checkpoint directory or a bundle.
+//! Finds the bundle file for a path: a run directory, a checkpoint directory or a bundle.
 //!
 //! ```text
-//! RUN/best.safetensors                                   the best weights of validation
-//! RUN/latest                                             text: name of the newest checkpoint, step-00000500
-//! RUN/checkpoints/step-00000500/average.safetensors      its averaged network, where the run has one: that is meant
-//! RUN/checkpoints/step-00000500/model.safetensors        its network in training
+//! RUN/best.safetensors                                best weights by validation
+//! RUN/latest                                          name of the newest checkpoint: step-00000500
+//! RUN/checkpoints/step-00000500/average.safetensors   averaged weights, if the run has them: preferred
+//! RUN/checkpoints/step-00000500/model.safetensors     weights in training
 //! ```
 //!
-//! A checkpoint also holds the best weights so far, which are not its own.
+//! A checkpoint also holds the best weights so far, which belong to the run.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -28,12 +28,12 @@ pub const MODEL: &str = "model.safetensors";
 /// The bundle file that `path` stands for.
 ///
 /// # Errors
-/// A directory without one, or a `latest` that cannot be read.
+/// A directory without a bundle, or a `latest` that cannot be read.
 pub(super) fn locate(path: &Path) -> Result<PathBuf, BundleError> {
     if !path.is_dir() {
         return Ok(path.into());
     }
-    if let Some(file) = of_checkpoint(path) {
+    if let Some(file) = checkpoint_weights(path) {
         return Ok(file);
     }
     let best = path.join(BEST);
@@ -49,11 +49,11 @@ pub(super) fn locate(path: &Path) -> Result<PathBuf, BundleError> {
         source,
     })?;
     let checkpoint = path.join(CHECKPOINTS).join(checkpoint.trim());
-    Ok(of_checkpoint(&checkpoint).unwrap_or_else(|| checkpoint.join(MODEL)))
+    Ok(checkpoint_weights(&checkpoint).unwrap_or_else(|| checkpoint.join(MODEL)))
 }
 
-/// The weights that a checkpoint stands for; `None` where `dir` is none.
-fn of_checkpoint(dir: &Path) -> Option<PathBuf> {
+/// The weights of a checkpoint directory; `None` if `dir` is none.
+fn checkpoint_weights(dir: &Path) -> Option<PathBuf> {
     let mut files = [AVERAGE, MODEL].map(|file| dir.join(file)).into_iter();
     files.find(|file| file.exists())
 }
@@ -63,7 +63,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_run_gives_its_best_weights_else_its_latest_checkpoint() -> std::io::Result<()> {
+    fn a_run_stands_for_its_best_weights_or_its_latest_checkpoint() -> std::io::Result<()> {
         let dir = tempfile::tempdir()?;
         let run = dir.path();
         let error = locate(run).expect_err("empty").to_string();

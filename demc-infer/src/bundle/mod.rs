@@ -1,12 +1,13 @@
-//! The bundle: one safetensors file with the weights of a network and everything else that its output depends on.
+//! The bundle: one safetensors file with the weights of a network and all data that its output
+//! depends on.
 //!
-//! The weights are tensors by name ([`Names`]: Burn's or PyTorch's) in f32 or f16 ([`Precision`]; batch normalisation
-//! stays f32). The header's metadata has one key, `demc`: [`BundleMeta`] as JSON, with the key `names` added. One key,
-//! because the `safetensors` crate keeps metadata in a hash map and writes it in random order: the same bundle
-//! gives the same bytes.
+//! The weights are tensors by name ([`Names`]: Burn's or PyTorch's) in f32 or f16 ([`Precision`];
+//! batch normalisation stays f32). The header's metadata has one key, `demc`: [`BundleMeta`] as
+//! JSON, with the key `names` added. A single key keeps the bytes reproducible, because the
+//! `safetensors` crate writes metadata in random order.
 //!
-//! Statistics and layout live with the weights on purpose: weights without them do not load, and no flag replaces
-//! them, since every number of the output depends on them.
+//! Statistics and layout are stored with the weights because every output value depends on them.
+//! Weights without them do not load, and no flag replaces them.
 
 mod encode;
 mod error;
@@ -27,10 +28,11 @@ pub use encode::{Names, Precision};
 pub use error::BundleError;
 pub use file::BundleFile;
 
-/// The bundle format that this build writes and reads. It goes up when a tensor's name or meaning changes.
+/// The bundle format that this build writes and reads. It increases when a tensor's name or meaning
+/// changes.
 pub const FORMAT: u32 = 1;
 
-/// Everything about a network but its weights.
+/// Everything about a network except its weights.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BundleMeta {
     /// Bundle format, [`FORMAT`].
@@ -39,12 +41,12 @@ pub struct BundleMeta {
     pub model: ModelConfig,
     /// Gamma and the training set's statistics.
     pub normalizer: Normalizer,
-    /// Which channels of a renderer's files are the 15 planes.
+    /// Which channels of a renderer's files hold the 15 planes.
     pub layout: ChannelLayout,
-    /// Optimizer steps that the weights have seen.
+    /// Number of optimizer steps behind the weights.
     pub step: u64,
-    /// What the training scenes were like, one by one; none in a bundle from elsewhere. The network does not need it,
-    /// [`guard`](crate::guard) does.
+    /// Ranges of the training scenes' statistics, which [`guard`](crate::guard) uses; `None` if
+    /// unknown.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ranges: Option<Ranges>,
 }
@@ -67,7 +69,7 @@ impl BundleMeta {
         }
     }
 
-    /// The same with what the training scenes were like.
+    /// Adds the ranges of the training scenes' statistics.
     pub fn with_ranges(self, ranges: Ranges) -> Self {
         Self {
             ranges: Some(ranges),
@@ -78,21 +80,21 @@ impl BundleMeta {
 
 /// A network ready to denoise, with its metadata.
 ///
-/// The model belongs on a plain device: on one with autodiff, batch normalisation would use the statistics of the
-/// image at hand.
+/// The model must be on a device without autodiff. With autodiff, batch normalisation would use the
+/// current image's statistics.
 #[derive(Debug, Clone)]
 pub struct Bundle {
-    /// Everything about the network but its weights.
+    /// Everything about the network except its weights.
     pub meta: BundleMeta,
     /// The network.
     pub model: Denoiser,
 }
 
 impl Bundle {
-    /// Writes the bundle to `path`, whole or not at all, mode 0644. Equal bundles give equal bytes.
+    /// Writes the bundle to `path` atomically, with mode 0644. Equal bundles give equal bytes.
     ///
     /// # Errors
-    /// A weight that f16 cannot hold (before anything is written), or a path that cannot be written.
+    /// A weight beyond f16's range (nothing is written), or a path that cannot be written.
     pub fn save(&self, path: &Path, names: Names, precision: Precision) -> Result<(), BundleError> {
         let bytes = self.to_bytes(names, precision)?;
         demc_data::file::write_whole(path, |file| file.write_all(&bytes))?;
@@ -102,16 +104,16 @@ impl Bundle {
     /// The bytes of the bundle's file. Equal bundles give equal bytes.
     ///
     /// # Errors
-    /// A weight that f16 cannot hold.
+    /// A weight beyond f16's range.
     pub fn to_bytes(&self, names: Names, precision: Precision) -> Result<Vec<u8>, BundleError> {
         encode::encode(&self.meta, self.model.weights(), names, precision)
     }
 
-    /// [`save`](Self::save), then reads the file back and compares: metadata and f32 tensors bit for bit, f16
-    /// tensors within their rounding.
+    /// Writes as [`save`](Self::save), reads the file back and compares: metadata and f32 tensors
+    /// bit for bit, f16 tensors within rounding.
     ///
     /// # Errors
-    /// As `save`, and [`BundleError::ReadBack`] with the first thing that differs.
+    /// As `save`, and [`BundleError::ReadBack`] with the first difference.
     pub fn export(
         &self,
         path: &Path,
@@ -127,26 +129,25 @@ impl Bundle {
         if back.meta != self.meta || back.names != names {
             return Err(differs("the header".into()));
         }
-        let mut weights = self.model.weights();
-        weights.sort_by(|a, b| a.name.cmp(&b.name));
+        let roles = self.meta.model.weight_specs().into_iter();
+        let roles = roles.map(|spec| spec.role);
+        let mut written: Vec<_> = self.model.weights().into_iter().zip(roles).collect();
+        written.sort_by(|(a, _), (b, _)| a.name.cmp(&b.name));
         back.weights.sort_by(|a, b| a.name.cmp(&b.name));
-        if weights.len() != back.weights.len() {
+        if written.len() != back.weights.len() {
             return Err(differs("the number of tensors".into()));
         }
-        match weights
-            .iter()
-            .zip(&back.weights)
-            .find(|(ours, theirs)| !precision.keeps(ours, theirs))
-        {
+        let mut pairs = written.iter().zip(&back.weights);
+        match pairs.find(|((weight, role), read)| !precision.preserves(*role, weight, read)) {
             None => Ok(()),
-            Some((ours, _)) => Err(differs(format!("tensor {}", ours.name))),
+            Some(((weight, _), _)) => Err(differs(format!("tensor {}", weight.name))),
         }
     }
 
-    /// The bundle that a file of this precision holds: in f16 with its weights rounded.
+    /// The bundle as a file of this precision holds it: with rounded weights for f16.
     ///
     /// # Errors
-    /// A weight that f16 cannot hold.
+    /// A weight beyond f16's range.
     pub fn rounded(&self, precision: Precision) -> Result<Self, BundleError> {
         match precision {
             Precision::F32 => Ok(self.clone()),
@@ -157,11 +158,13 @@ impl Bundle {
         }
     }
 
-    /// Loads a run directory (its best weights, else those of the latest checkpoint), a checkpoint directory or a
-    /// bundle file, with either set of names, onto `device`. f16 tensors become f32.
+    /// Loads a run directory, a checkpoint directory or a bundle file onto `device`.
+    ///
+    /// A run directory stands for its best weights, or for those of the latest checkpoint if there
+    /// are none. Both sets of names load; f16 tensors become f32.
     ///
     /// # Errors
-    /// Each [`BundleError`] of reading; a tensor that is missing, left over or misshaped is named.
+    /// As [`BundleFile::read`]; a missing, superfluous or misshaped tensor, by name.
     pub fn load(path: &Path, device: &Device) -> Result<Self, BundleError> {
         BundleFile::read(path)?.into_bundle(device)
     }
@@ -171,7 +174,7 @@ impl BundleFile {
     /// The network that the file describes, with its weights, on `device`.
     ///
     /// # Errors
-    /// A tensor that is missing, left over or misshaped.
+    /// A missing, superfluous or misshaped tensor, by name.
     pub fn into_bundle(self, device: &Device) -> Result<Bundle, BundleError> {
         let Self {
             path,

@@ -1,4 +1,4 @@
-//! Named tensors and the bytes of a safetensors file: all that this project writes and reads of that format.
+//! Converts named tensors to and from the bytes of a safetensors file.
 
 use std::collections::HashMap;
 
@@ -6,21 +6,21 @@ use demc_model::Weight;
 use half::f16;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
-/// A tensor as a file holds it.
-pub(super) struct Encoded {
+/// A tensor as stored in a file.
+pub(super) struct EncodedTensor {
     pub name: String,
     pub dtype: Dtype,
     pub shape: Vec<usize>,
     pub bytes: Vec<u8>,
 }
 
-/// The bytes of a file. safetensors sorts tensors by type and name, so equal inputs give equal bytes, as long as there is
-/// no more than one key of `metadata`.
+/// The bytes of a file. safetensors sorts tensors by type and name, so equal inputs give equal
+/// bytes if `metadata` has at most one key.
 ///
 /// # Errors
-/// A tensor whose bytes do not fit its shape, in words.
+/// A message about a tensor whose bytes do not fit its shape.
 pub(super) fn serialize(
-    tensors: &[Encoded],
+    tensors: &[EncodedTensor],
     metadata: Option<HashMap<String, String>>,
 ) -> Result<Vec<u8>, String> {
     let views = tensors.iter().map(|tensor| {
@@ -38,7 +38,10 @@ pub(crate) fn f32_bytes(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 
-/// The values of a tensor as f32, or what is wrong with them.
+/// The values of a tensor as f32.
+///
+/// # Errors
+/// A message about a type other than f32 and f16, NaN or infinity.
 pub(super) fn values(view: &TensorView<'_>) -> Result<Vec<f32>, String> {
     let bytes = view.data();
     let data: Vec<f32> = match view.dtype() {
@@ -62,7 +65,8 @@ pub(super) fn values(view: &TensorView<'_>) -> Result<Vec<f32>, String> {
     }
 }
 
-/// Text from a file as it may stand in a message: one line, and nothing that a terminal obeys.
+/// Text from a file with control characters escaped, so that it is one line and safe for a
+/// terminal.
 pub(super) fn one_line(text: &str) -> String {
     let escape = |c: char| match c.is_control() {
         true => c.escape_default().collect(),
@@ -71,14 +75,14 @@ pub(super) fn one_line(text: &str) -> String {
     text.chars().map(escape).collect()
 }
 
-/// The bytes of a file of f32 tensors without metadata: an optimizer's state.
+/// The bytes of a file with f32 tensors and no metadata, for an optimizer's state.
 ///
 /// # Errors
 /// A tensor whose values do not fit its shape.
 pub fn to_bytes(weights: &[Weight]) -> Result<Vec<u8>, super::BundleError> {
-    let encoded: Vec<Encoded> = weights
+    let encoded: Vec<EncodedTensor> = weights
         .iter()
-        .map(|weight| Encoded {
+        .map(|weight| EncodedTensor {
             name: weight.name.clone(),
             dtype: Dtype::F32,
             shape: weight.shape.clone(),
@@ -88,11 +92,11 @@ pub fn to_bytes(weights: &[Weight]) -> Result<Vec<u8>, super::BundleError> {
     serialize(&encoded, None).map_err(super::BundleError::Encode)
 }
 
-/// The tensors of such a file, in any order.
+/// The tensors of a file from [`to_bytes`], in any order.
 ///
 /// # Errors
-/// Bytes that are cut short or no such file; a tensor of another type than f32 and f16 or with NaN or infinity in it. In
-/// words.
+/// A message: the bytes are cut short or no safetensors file, or a tensor has a type other than f32
+/// and f16, NaN or infinity.
 pub fn from_bytes(bytes: &[u8]) -> Result<Vec<Weight>, String> {
     let file = SafeTensors::deserialize(bytes).map_err(|error| one_line(&error.to_string()))?;
     let weights = file.tensors().into_iter().map(|(name, view)| {
@@ -109,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn weights_come_back() {
+    fn weights_survive_a_round_trip() {
         let weight = |name: &str, data: &[f32]| Weight {
             name: name.into(),
             shape: vec![1, data.len()],

@@ -1,4 +1,4 @@
-//! A tiny network with random weights and a frame with a pattern, for the tests of this crate.
+//! A tiny network with random weights and a frame with a pattern, for this crate's tests.
 
 use burn::tensor::Device;
 use demc_data::{ChannelLayout, FEATURES, FeatureStats, Frame, Normalizer};
@@ -8,7 +8,7 @@ use rand_chacha::rand_core::SeedableRng;
 
 use super::{Bundle, BundleMeta};
 
-/// Base width 2, the released reading: it has batch normalisation in most places.
+/// A network of base width 2 in the released reading, which has the most batch normalisation.
 pub(crate) fn bundle(variant: Variant) -> Bundle {
     let model = ModelConfig {
         variant,
@@ -22,7 +22,7 @@ pub(crate) fn bundle(variant: Variant) -> Bundle {
     };
     let normalizer = Normalizer {
         gamma: 2.2,
-        demodulate: 0.0,
+        albedo_demodulation_epsilon: None,
         features,
         flat_color: [0.4, 0.3, 0.2],
     };
@@ -34,7 +34,7 @@ pub(crate) fn bundle(variant: Variant) -> Bundle {
     }
 }
 
-/// A frame without reference whose values follow a pattern, 0 to 1.
+/// A frame without reference. Its values follow a pattern between 0 and 1.
 pub(crate) fn frame(width: usize, height: usize) -> Frame {
     let pattern = |channels: usize| {
         let values = 0..channels * width * height;

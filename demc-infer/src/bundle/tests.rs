@@ -1,4 +1,4 @@
-//! Tests of the bundle as a whole: round trips, and every way in which a file can be wrong.
+//! Tests of the bundle as a whole: round trips, and every kind of invalid file.
 
 use std::collections::HashMap;
 use std::fs;
@@ -16,11 +16,11 @@ const STYLES: [(Names, Precision); 4] = [
     (Names::Torch, Precision::F16),
 ];
 
-/// A tensor list to edit, and back to a file.
-type Tensors = Vec<(String, Dtype, Vec<usize>, Vec<u8>)>;
+/// The tensors of a file: name, type, shape, bytes.
+type TensorList = Vec<(String, Dtype, Vec<usize>, Vec<u8>)>;
 
-/// The error of loading `tensors` with the metadata `header` under the key `demc`.
-fn load_error(tensors: &Tensors, header: Option<&str>) -> String {
+/// The error when `tensors` are loaded with the metadata `header` under the key `demc`.
+fn load_error(tensors: &TensorList, header: Option<&str>) -> String {
     let views = tensors.iter().map(|(name, dtype, shape, bytes)| {
         (
             name,
@@ -31,7 +31,7 @@ fn load_error(tensors: &Tensors, header: Option<&str>) -> String {
     error_of(&safetensors::serialize(views, metadata).expect("bytes"))
 }
 
-/// The error of loading a file with these bytes, its path taken off.
+/// The error when a file with these bytes is loaded, without its path.
 fn error_of(bytes: &[u8]) -> String {
     let dir = tempfile::tempdir().expect("directory");
     let path = dir.path().join("x.safetensors");
@@ -48,8 +48,8 @@ fn error_of(bytes: &[u8]) -> String {
         .into()
 }
 
-/// The parts of a good file: tensors and header.
-fn good() -> (Tensors, String) {
+/// Tensors and header of a valid file.
+fn good() -> (TensorList, String) {
     let bundle = bundle(Variant::Demc);
     let bytes = encode::encode(
         &bundle.meta,
@@ -73,7 +73,7 @@ fn good() -> (Tensors, String) {
 }
 
 #[test]
-fn every_style_comes_back_as_it_was() {
+fn every_naming_and_precision_survives_a_round_trip() {
     for variant in Variant::ALL {
         let bundle = bundle(variant);
         for (names, precision) in STYLES {
@@ -145,7 +145,7 @@ fn a_file_cut_short_anywhere_is_refused() {
 }
 
 #[test]
-fn files_of_others_and_of_other_versions_are_refused() {
+fn foreign_files_and_other_formats_are_refused() {
     let (tensors, header) = good();
     assert!(load_error(&tensors, None).contains("no DEMC bundle"));
     let newer = header.replacen("\"format\":1", "\"format\":2", 1);
@@ -188,7 +188,11 @@ fn a_tensor_that_does_not_fit_is_named() {
 
     let mut extra = tensors.clone();
     extra.push(("decoder.tail".into(), Dtype::F32, vec![1], vec![0; 4]));
-    assert!(load_error(&extra, Some(&header)).contains("weight decoder.tail does not belong"));
+    let error = load_error(&extra, Some(&header));
+    assert!(
+        error.contains("weight decoder.tail is not part of this network"),
+        "{error}"
+    );
 
     let mut misshaped = tensors.clone();
     misshaped[head].2 = vec![3, 1];
@@ -226,4 +230,21 @@ fn names_with_line_breaks_do_not_break_messages() {
         error.starts_with("header entry `demc`: unknown field `var\\niant`"),
         "{error}"
     );
+}
+
+/// The bundled model was exported by the first edition.
+#[test]
+fn a_file_of_the_first_edition_loads() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/demc.safetensors");
+    let file = BundleFile::read(path.as_ref()).expect("the bundled model");
+    let normalizer = &file.meta.normalizer;
+    assert_eq!(normalizer.albedo_demodulation_epsilon, Some(0.07));
+    file.into_bundle(&Device::flex()).expect("all tensors");
+    // Without demodulation the first edition wrote 0, or no such key.
+    for text in ["\"demodulate\":0.0,", ""] {
+        let json = serde_json::to_string(&bundle(Variant::Demc).meta).expect("JSON");
+        let json = json.replacen("\"gamma\":2.2,", &format!("\"gamma\":2.2,{text}"), 1);
+        let meta: BundleMeta = serde_json::from_str(&json).expect("a header");
+        assert_eq!(meta.normalizer.albedo_demodulation_epsilon, None);
+    }
 }

@@ -1,31 +1,32 @@
-//! `demc-infer check`: whether images are what a model was trained on.
+//! `demc-infer check`: compares images with a model's training data.
 
 use std::path::PathBuf;
 
 use clap::Args;
-use demc_data::Summary;
+use demc_data::FrameSummary;
 use demc_data::frame::{FEATURE_NAMES, read_input};
 use demc_data::ranges::Range;
 use demc_infer::Bundle;
 use serde::Serialize;
 
+use super::flags::{DeviceFlag, ModelFlag};
 use super::inputs::{Frames, Inputs};
-use super::{Clamped, DeviceFlag, Model, print};
+use super::{Clamped, print};
 
-/// Whether images are like those that a model was trained on: every channel beside the training scenes, and warnings.
+/// Compare images with a model's training data: statistics of each channel, and warnings.
 ///
-/// The same warnings come with `denoise`. Exit code 1: there was one.
+/// `denoise` prints the same warnings. The exit code is 1 if an image has a warning.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer check noisy.exr
   demc-infer check --model runs/demc --json renders/ | jq '.[].warnings'")]
-pub struct Check {
+pub struct Arguments {
     #[command(flatten)]
-    model: Model,
-    /// Images: files, directories, patterns, frame sequences
+    model: ModelFlag,
+    /// Images: files, directories, glob patterns, or frame sequences
     #[arg(value_name = "IN.exr", required = true)]
     inputs: Vec<PathBuf>,
-    /// Of sequences, only these frames
+    /// Only these frames of sequences
     #[arg(long, value_name = "FIRST-LAST")]
     frames: Option<Frames>,
     /// Print JSON
@@ -36,36 +37,36 @@ pub struct Check {
 }
 
 #[derive(Serialize)]
-struct Checked {
+struct FileCheck {
     file: PathBuf,
-    exposure: Row,
-    channels: Vec<Channel>,
+    exposure: CheckedValue,
+    channels: Vec<ChannelCheck>,
     warnings: Vec<String>,
 }
 
-/// A number of the image, and the range of the training scenes where the model has it.
+/// A value of the image, and its range over the training scenes if the model has it.
 #[derive(Serialize)]
-struct Row {
+struct CheckedValue {
     value: f64,
     training: Option<Range>,
 }
 
 #[derive(Serialize)]
-struct Channel {
+struct ChannelCheck {
     channel: &'static str,
-    mean: Row,
-    std: Row,
+    mean: CheckedValue,
+    std: CheckedValue,
 }
 
-impl Check {
-    /// Checks every image; the first that cannot be read ends it.
+impl Arguments {
+    /// Checks every image; an unreadable one ends the run.
     pub fn run(self) -> anyhow::Result<()> {
         let inputs = Inputs::expand(&self.inputs, self.frames)?;
         let bundle = self.model.load_onto(&self.device)?;
         let mut all = Vec::with_capacity(inputs.files.len());
         let mut clamped = Clamped::default();
         for path in inputs.files {
-            let (checked, negative) = Checked::new(path, &bundle)?;
+            let (checked, negative) = FileCheck::new(path, &bundle)?;
             clamped.count(negative);
             if !self.json {
                 print(&checked.text())?;
@@ -79,26 +80,26 @@ impl Check {
         let warned = all.iter().filter(|checked| !checked.warnings.is_empty());
         match warned.count() {
             0 => Ok(()),
-            warned => anyhow::bail!("{warned} of {} images with warnings", all.len()),
+            warned => anyhow::bail!("{warned} of {} images have warnings", all.len()),
         }
     }
 }
 
-impl Checked {
-    /// The check of one file, and how many of its samples were negative.
+impl FileCheck {
+    /// Checks one file. Also returns its number of negative samples.
     fn new(file: PathBuf, bundle: &Bundle) -> anyhow::Result<(Self, usize)> {
         let frame = read_input(&file, &bundle.meta.layout)?;
-        let Summary {
+        let FrameSummary {
             exposure,
             mean,
             std,
-        } = Summary::of(&frame);
+        } = FrameSummary::of(&frame);
         let ranges = bundle.meta.ranges.as_ref();
-        let row = |value, training: Option<Range>| Row { value, training };
+        let row = |value, training: Option<Range>| CheckedValue { value, training };
         let channels = FEATURE_NAMES
             .iter()
             .enumerate()
-            .map(|(i, channel)| Channel {
+            .map(|(i, channel)| ChannelCheck {
                 channel,
                 mean: row(mean[i], ranges.map(|ranges| ranges.mean[i])),
                 std: row(std[i], ranges.map(|ranges| ranges.std[i])),
@@ -109,7 +110,7 @@ impl Checked {
             .map(|warning| warning.to_string())
             .collect();
         if let Err(refused) = bundle.check_statistics(&frame) {
-            warnings.push(format!("denoise refuses it: {refused}"));
+            warnings.push(format!("`denoise` refuses this image: {refused}"));
         }
         let checked = Self {
             file,
@@ -121,7 +122,7 @@ impl Checked {
     }
 
     fn text(&self) -> String {
-        let range = |row: &Row| match row.training {
+        let range = |row: &CheckedValue| match row.training {
             Some(Range { low, high }) => format!("{low:.3} to {high:.3}"),
             None => "unknown".into(),
         };
@@ -144,15 +145,19 @@ impl Checked {
                 ""
             ),
         ];
-        lines.extend(self.channels.iter().map(|Channel { channel, mean, std }| {
-            format!(
-                "| {channel:<10} | {:>9.3} | {:>20} | {:>9.3} | {:>20} |",
-                mean.value,
-                range(mean),
-                std.value,
-                range(std)
-            )
-        }));
+        lines.extend(
+            self.channels
+                .iter()
+                .map(|ChannelCheck { channel, mean, std }| {
+                    format!(
+                        "| {channel:<10} | {:>9.3} | {:>20} | {:>9.3} | {:>20} |",
+                        mean.value,
+                        range(mean),
+                        std.value,
+                        range(std)
+                    )
+                }),
+        );
         lines.extend(
             self.warnings
                 .iter()

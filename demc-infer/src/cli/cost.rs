@@ -1,4 +1,4 @@
-//! `demc-infer cost`: what denoising takes, before it is done.
+//! `demc-infer cost`: computes the cost of denoising in advance.
 
 use std::path::PathBuf;
 
@@ -8,22 +8,22 @@ use demc_infer::{Bundle, Ensemble, Tiling, memory};
 use demc_model::{DOWNSAMPLING, ModelConfig};
 use serde::Serialize;
 
-use super::tiling::{TilingFlags, describe};
-use super::{DeviceFlag, Model, print};
+use super::flags::{DeviceFlag, ModelFlag, TilingFlags, describe};
+use super::print;
 
-/// What denoising an image takes: parameters, operations, memory, tiles. Nothing is denoised.
+/// Show the cost of denoising: parameters, operations, memory and tiles. Nothing is denoised.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer cost --size 1280x720
   demc-infer cost --model runs/demc --size 7680x4320 --memory 6000
   demc-infer cost --json noisy.exr | jq .images[0].tiles")]
-pub struct Cost {
+pub struct Arguments {
     #[command(flatten)]
-    model: Model,
-    /// Images, of which the header is read
+    model: ModelFlag,
+    /// Images; only their headers are read
     #[arg(value_name = "IN.exr", required_unless_present = "sizes")]
     inputs: Vec<PathBuf>,
-    /// Sizes in pixels
+    /// Image size in pixels. The flag can be repeated
     #[arg(long = "size", value_name = "WxH", value_parser = size)]
     sizes: Vec<(usize, usize)>,
     #[command(flatten)]
@@ -35,10 +35,9 @@ pub struct Cost {
     device: DeviceFlag,
 }
 
-/// Longest side that is asked about, in pixels: a longer one is a slip.
+/// Longest accepted side in pixels; a longer one is a typing error.
 const MAX_SIDE: usize = 1 << 17;
 
-/// `1280x720`.
 fn size(text: &str) -> Result<(usize, usize), String> {
     let side = |text: &str| {
         let side = text.parse().ok();
@@ -51,28 +50,29 @@ fn size(text: &str) -> Result<(usize, usize), String> {
 }
 
 #[derive(Serialize)]
-struct Report {
+struct CostReport {
     #[serde(flatten)]
     network: ModelConfig,
     parameters: u64,
-    /// Of the weights in memory.
+    /// Size of the weights in memory.
     weight_bytes: u64,
-    /// What is free for a pass; none where nobody tells.
+    /// Memory available for a pass; `None` if unknown.
     available_bytes: Option<u64>,
-    images: Vec<Image>,
+    images: Vec<ImageCost>,
 }
 
 #[derive(Serialize)]
-struct Image {
+struct ImageCost {
     width: usize,
     height: usize,
-    /// Floating-point operations, halos and padding included; a multiplication and an addition count as two.
+    /// Floating-point operations with halos and padding. Multiplication and addition count as one
+    /// each.
     flops: f64,
     /// Operations without halos.
     flops_whole: f64,
-    /// What a pass over the largest tile takes beside weights and images.
+    /// Memory of a pass over the largest tile, in addition to weights and images.
     pass_bytes: u64,
-    /// What the image takes, as 32-bit floats: colour, features, output.
+    /// Memory of colour, features and output as 32-bit floats.
     image_bytes: u64,
     tiles: usize,
     largest_tile: [usize; 2],
@@ -80,8 +80,7 @@ struct Image {
     plan: String,
 }
 
-impl Cost {
-    /// Prints the costs of every size.
+impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let bundle = self.model.load_onto(&self.device)?;
         let tiling = self.tiling.tiling();
@@ -95,7 +94,7 @@ impl Cost {
         let images = sizes
             .into_iter()
             .map(|(width, height)| image(&bundle, &tiling, width, height));
-        let report = Report {
+        let report = CostReport {
             network: *config,
             parameters,
             weight_bytes: parameters * size_of::<f32>() as u64,
@@ -114,12 +113,12 @@ fn image(
     tiling: &Tiling,
     width: usize,
     height: usize,
-) -> Result<Image, memory::TooLarge> {
+) -> Result<ImageCost, memory::TooLarge> {
     let tiles = bundle.tiles(height, width, tiling, Ensemble::One)?;
     let config = bundle.model.config();
     let (tall, wide) = tiles.largest();
     let padded = height.next_multiple_of(DOWNSAMPLING) * width.next_multiple_of(DOWNSAMPLING);
-    Ok(Image {
+    Ok(ImageCost {
         width,
         height,
         flops: config.flops_per_pixel() * tiles.computed_pixels() as f64,
@@ -132,7 +131,7 @@ fn image(
     })
 }
 
-impl Report {
+impl CostReport {
     fn text(&self) -> String {
         let mib = |bytes: u64| bytes.div_ceil(1 << 20);
         let mut lines = vec![
@@ -148,7 +147,7 @@ impl Report {
             },
         ];
         for image in &self.images {
-            let Image { width, height, .. } = image;
+            let ImageCost { width, height, .. } = image;
             lines.push(format!(
                 "\n{width}x{height}\n  operations  {:.1} GFLOP ({:.1} without halos)\n  memory      {} MiB for a pass, {} MiB for the image and its features\n  tiles       {}",
                 image.flops / 1e9,

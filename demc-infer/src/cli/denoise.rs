@@ -1,69 +1,77 @@
-//! `demc-infer denoise`: EXR in, EXR out, one file after another.
+//! `demc-infer denoise`: denoises EXR files one after another.
 
 use std::fs;
 use std::path::PathBuf;
 
 use anyhow::Context;
-use clap::Args;
-use demc_data::exr::ExrFile;
+use clap::{Args, ValueEnum};
+use demc_data::ChannelLayout;
+use demc_data::exr::rewrite::{OutputChannels, WriteOptions, rewrite};
+use demc_data::exr::{Compression, ExrFile};
 use demc_data::frame::decode_input;
 use demc_infer::denoise::SeamError;
 use demc_infer::guard::EnergyBias;
 use demc_infer::{Bundle, Picture, memory};
 
+use super::Clamped;
+use super::flags::{DeviceFlag, EnsembleFlag, ModelFlag, TilingFlags, describe};
 use super::inputs::{Frames, Inputs};
 use super::jobs::{Job, Jobs};
-use super::tiling::{TilingFlags, describe};
-use super::writing::Writing;
-use super::{Clamped, DeviceFlag, EnsembleFlag, Model};
-use crate::progress::Progress;
+use super::progress::Progress;
 
-/// Most bytes of an input's decoded blocks that are kept until its output is written (ours: 19 half channels of 1920x1080
-/// three times; what is beyond is decompressed twice).
-const MOST_KEPT: u64 = 256 << 20;
+/// Largest cache of an input's decoded blocks in bytes, kept until its output is written (ours:
+/// three times 19 half channels of 1920x1080). Blocks beyond it are decompressed twice.
+const MAX_CACHE: u64 = 256 << 20;
 
-/// How many are kept with the memory that there is: the network needs most of it.
-fn kept_bytes() -> usize {
-    let room = memory::available().map_or(MOST_KEPT, |bytes| bytes / 16);
-    room.min(MOST_KEPT) as usize
+/// Size of that cache with the available memory, most of which the network needs.
+fn cache_bytes() -> usize {
+    let share = memory::available().map_or(MAX_CACHE, |bytes| bytes / 16);
+    share.min(MAX_CACHE) as usize
 }
 
 /// Denoise OpenEXR images of any size.
 ///
-/// The channels are those of the layout that the model was trained with; `demc-infer inspect` shows it. The output is the input with
-/// another colour: parts, windows, attributes, compression and all other channels stay. Negative radiance counts as 0. An image that does not fit into memory is denoised in tiles that equal it; `demc-infer cost` tells beforehand.
+/// Inputs are files, directories, glob patterns, or frame sequences. Failed inputs are reported and
+/// skipped, and the exit code is 1. Rerun the command to resume a partly finished directory.
 ///
-/// A file that fails is reported, the others are still denoised, and the exit code is 1 in the end. An image that is unlike what
-/// the model was trained on gets a warning with the likely cause.
+/// The input's channels must have the names of the model's layout, which `demc-infer inspect`
+/// shows. An image that differs from the training data causes a warning with the likely cause.
+/// Negative radiance counts as 0.
+///
+/// The output is the input with denoised colour. Parts, windows, attributes, compression and all
+/// other channels stay.
+///
+/// An image that does not fit into memory is denoised in tiles with the same result. `demc-infer
+/// cost` shows the tiles in advance.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer denoise noisy.exr -o clean.exr
   demc-infer denoise --model runs/quickstart noisy.exr -o clean.exr --png
   demc-infer denoise --model demc.safetensors renders/ -o denoised/
   demc-infer denoise 'shot.####.exr' --frames 1-240 -o denoised/")]
-pub struct Denoise {
+pub struct Arguments {
     #[command(flatten)]
-    model: Model,
-    /// Noisy images with their feature channels: files, directories (their *.exr), patterns, frame sequences (shot.####.exr
-    /// or shot.%04d.exr)
+    model: ModelFlag,
+    /// Noisy images with feature channels: files, directories (their *.exr), glob patterns, or
+    /// frame sequences (shot.####.exr or shot.%04d.exr)
     #[arg(value_name = "IN.exr", required = true)]
     inputs: Vec<PathBuf>,
-    /// Output: a file for one input; a directory, made if needed, for several. In a directory, images that are there already
-    /// are done and skipped
+    /// Output file for one input, output directory for several. A directory is created if needed;
+    /// images that exist in it are skipped
     #[arg(short, long, value_name = "OUT")]
     output: PathBuf,
-    /// Replace outputs that exist; an input is never replaced
+    /// Replace existing outputs. Inputs are never replaced
     #[arg(long)]
     overwrite: bool,
-    /// Of sequences, only these frames
+    /// Only these frames of sequences
     #[arg(long, value_name = "FIRST-LAST")]
     frames: Option<Frames>,
     #[command(flatten)]
-    writing: Writing,
-    /// Also write a preview beside each output, NAME.png: clip(2^EXPOSURE x, 0, 1)^(1/2.2)
+    output_flags: OutputFlags,
+    /// Also write a preview NAME.png beside each output: clip(2^EXPOSURE x, 0, 1)^(1/2.2)
     #[arg(long)]
     png: bool,
-    /// Exposure of previews, in stops
+    /// Exposure of previews in stops
     #[arg(
         long,
         value_name = "STOPS",
@@ -80,8 +88,7 @@ pub struct Denoise {
     device: DeviceFlag,
 }
 
-impl Denoise {
-    /// Denoises all inputs.
+impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let inputs = Inputs::expand(&self.inputs, self.frames)?;
         let mut jobs = Jobs::new(&inputs, &self.output)?;
@@ -90,7 +97,7 @@ impl Denoise {
         }
         if jobs.skipped > 0 {
             let (done, all) = (jobs.skipped, jobs.skipped + jobs.list.len());
-            eprintln!("note: {done} of {all} images are there already; --overwrite replaces them");
+            eprintln!("note: {done} of {all} images already exist; --overwrite replaces them");
         }
         let bundle = self.model.load_onto(&self.device)?;
         if jobs.directory {
@@ -117,27 +124,28 @@ impl Denoise {
         clamped.report();
         anyhow::ensure!(
             failed == 0,
-            "{failed} of {} images not denoised",
+            "{failed} of {} images were not denoised",
             jobs.len()
         );
         Ok(())
     }
 
-    /// Returns the number of negative samples that were set to 0.
+    /// Denoises one image. Returns the number of negative samples, which were set to 0.
     fn image(&self, job: &Job, bundle: &Bundle, progress: &Progress) -> anyhow::Result<usize> {
         let name = job.input.display();
         let layout = &bundle.meta.layout;
-        let mut file = ExrFile::open(&job.input)?.keeping(layout, kept_bytes());
+        let mut file = ExrFile::open(&job.input)?.keeping(layout, cache_bytes());
         let frame = decode_input(&mut file, layout)?;
         for warning in bundle.warnings(&frame)? {
             progress.line(format_args!("warning: {name}: {warning}"));
         }
         let tiling = self.tiling.tiling();
-        let denoised = bundle.denoise_tiled(&frame, &tiling, self.ensemble.looks, |done, of| {
-            if of > 1 {
-                progress.start(format_args!("{name}, tile {} of {of}", done + 1));
+        let on_tile = |done, count| {
+            if count > 1 {
+                progress.start(format_args!("{name}, tile {} of {count}", done + 1));
             }
-        })?;
+        };
+        let denoised = bundle.denoise_tiled(&frame, &tiling, self.ensemble.passes, on_tile)?;
         if denoised.tiles.count() > 1 {
             let plan = describe(&denoised.tiles, &tiling);
             progress.line(format_args!("note: {name}: {plan}"));
@@ -149,14 +157,15 @@ impl Denoise {
                 windows,
             } = error;
             progress.line(format_args!(
-                "note: {name}: against exact tiles, at {windows} places on seams: RelMSE {relmse:.2e}, largest difference {largest:.2e} of the largest value"
+                "note: {name}: error at seams, from {windows} windows denoised exactly: RelMSE {relmse:.2e}, \
+                 largest difference {largest:.2e} of the largest value"
             ));
         }
         let image = &denoised.color_hdr;
         if let Some(warning) = EnergyBias::of(&frame, image).warning() {
             progress.line(format_args!("warning: {name}: {warning}"));
         }
-        // The preview first: an image that is there is done.
+        // The preview comes first, because an existing output counts as finished.
         if self.png {
             let exposed: Vec<f32> = image.iter().map(|x| x * self.exposure.exp2()).collect();
             let path = job.preview();
@@ -164,9 +173,66 @@ impl Denoise {
                 .write_png(&path)
                 .with_context(|| format!("cannot write {}", path.display()))?;
         }
-        for note in self.writing.write(&mut file, job, layout, image)? {
+        for note in self.output_flags.write(&mut file, job, layout, image)? {
             progress.line(format_args!("note: {name}: {note}"));
         }
         Ok(frame.clamped)
+    }
+}
+
+/// `--precision`, `--compression`, `--only-color`.
+#[derive(Args)]
+struct OutputFlags {
+    /// Type of the colour channels: half has 11 bits of precision and a maximum of 65504 [default:
+    /// as the input]
+    #[arg(long, value_enum)]
+    precision: Option<OutputPrecision>,
+    /// none, rle, zips, zip, piz, pxr24, b44, b44a, dwaa or dwab. The last five are lossy [default:
+    /// as the input, or zip if that would change the copied channels]
+    #[arg(long, value_name = "NAME")]
+    compression: Option<Compression>,
+    /// Write only colour and alpha
+    #[arg(long)]
+    only_color: bool,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum OutputPrecision {
+    /// 16-bit floating point
+    Half,
+    /// 32-bit floating point
+    Float,
+}
+
+impl OutputFlags {
+    /// Writes the job's output: `input` with the denoised colour. Returns notes about other
+    /// differences from the input.
+    fn write(
+        &self,
+        input: &mut ExrFile,
+        job: &Job,
+        layout: &ChannelLayout,
+        color_hdr: &[f32],
+    ) -> Result<Vec<String>, demc_data::Error> {
+        let options = WriteOptions {
+            channels: match self.only_color {
+                true => OutputChannels::Color,
+                false => OutputChannels::All,
+            },
+            precision: self.precision.map(|precision| match precision {
+                OutputPrecision::Half => demc_data::SamplePrecision::Half,
+                OutputPrecision::Float => demc_data::SamplePrecision::Float,
+            }),
+            compression: self.compression,
+        };
+        let written = rewrite(input, layout, color_hdr, &job.output, &options)?;
+        let mut notes: Vec<String> = written.changes.iter().map(ToString::to_string).collect();
+        if written.clamped > 0 {
+            let clamped = written.clamped;
+            notes.push(format!(
+                "{clamped} samples above 65504, the maximum of half, are written as 65504"
+            ));
+        }
+        Ok(notes)
     }
 }

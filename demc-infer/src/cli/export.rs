@@ -1,4 +1,4 @@
-//! `demc-infer export`: weights for other programs, in one file.
+//! `demc-infer export`: writes a model as one file for other programs.
 
 use std::env;
 use std::path::{Path, PathBuf};
@@ -8,49 +8,55 @@ use clap::{Args, ValueEnum};
 use demc_infer::verify::{Runtime, TOLERANCE, verify};
 use demc_infer::{Bundle, Names, Precision};
 
-use super::{Model, Usage, not_an_input, print};
+use super::flags::ModelFlag;
+use super::{UsageError, not_an_input, print};
 
-/// Variable with the interpreter that `--verify` uses.
+/// Variable with the interpreter for `--verify`.
 const PYTHON_VARIABLE: &str = "DEMC_PYTHON";
 
-/// Export a model as one file: safetensors with configuration, statistics and channel layout, or an ONNX graph from a
-/// renderer's HDR colour and raw features to HDR colour.
+/// Export a model as one file: safetensors or an ONNX graph.
 ///
-/// The file is read back and compared before success is reported. `demc-infer` loads safetensors like a run directory, with
-/// either style of names.
+/// A safetensors file has the weights, configuration, statistics and channel layout. `demc-infer`
+/// loads it like a run directory, with either set of names. An ONNX graph takes a renderer's HDR
+/// colour and raw features as input and returns HDR colour.
+///
+/// The file is read back and compared.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer export --model runs/demc -o demc.safetensors
   demc-infer export --model runs/demc --names torch --precision f16 -o demc-torch.safetensors
   demc-infer export --model runs/demc --format onnx --verify -o demc.onnx")]
-pub struct Export {
+pub struct Arguments {
     #[command(flatten)]
-    model: Model,
+    model: ModelFlag,
     /// File format
     #[arg(long, value_enum, default_value = "safetensors")]
     format: Format,
-    /// Names of the tensors in a safetensors file: those of Burn or those that PyTorch's load_state_dict expects
+    /// Names of the tensors in a safetensors file: Burn's, or those that PyTorch's load_state_dict
+    /// expects
     #[arg(long, value_enum, default_value = "burn")]
     names: NamesFlag,
-    /// Type of the weights. Batch normalisation stays f32, and an ONNX graph computes in f32 either way
+    /// Type of the stored weights. Batch normalisation stays f32, and ONNX graphs always compute in
+    /// f32
     #[arg(long, value_enum, default_value = "f32")]
     precision: PrecisionFlag,
-    /// The file to write; an existing one is replaced, but never the model itself
+    /// Output file. An existing file is replaced, but never the model itself
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Run the file on synthetic images, in ONNX Runtime or in PyTorch, and compare; fail above 1e-4
+    /// Run the file on synthetic images in ONNX Runtime or PyTorch and compare. Deviations above
+    /// 1e-4 fail
     #[arg(long)]
     verify: bool,
-    /// The Python for --verify [default: the variable DEMC_PYTHON, else python3]
+    /// Python interpreter for --verify [default: the variable DEMC_PYTHON, or python3]
     #[arg(long, value_name = "PYTHON", requires = "verify")]
     python: Option<PathBuf>,
 }
 
 #[derive(Clone, Copy, PartialEq, ValueEnum)]
 enum Format {
-    /// Weights, to be loaded by demc-infer or by PyTorch with the package of python/
+    /// Weights for demc-infer, or for PyTorch with the package of python/
     Safetensors,
-    /// A graph, to be run by ONNX Runtime, TensorRT, OpenVINO and others
+    /// A graph for ONNX Runtime, TensorRT, OpenVINO and others
     Onnx,
 }
 
@@ -66,18 +72,17 @@ enum PrecisionFlag {
     F16,
 }
 
-impl Export {
-    /// Loads, writes, reads back, reports; runs what was written where that is asked for.
+impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let file = self.model.read()?;
-        // Rounding to f16 cannot be taken back: the model must outlive its export.
+        // Rounding to f16 cannot be undone, so an export must not replace its model.
         not_an_input(&self.output, &[(&file.path, "the model")])?;
         let names = match self.names {
             NamesFlag::Burn => Names::Burn,
             NamesFlag::Torch => Names::Torch,
         };
         if self.format == Format::Onnx && names == Names::Torch {
-            return Err(Usage("--names is for safetensors; ONNX has none to choose".into()).into());
+            return Err(UsageError("--names is for safetensors only".into()).into());
         }
         let precision = match self.precision {
             PrecisionFlag::F32 => Precision::F32,
@@ -104,7 +109,7 @@ impl Export {
         }
     }
 
-    /// Runs the file and prints how far it is from `expected`.
+    /// Runs the file and prints its deviation from `expected`.
     fn verify(&self, expected: &Bundle) -> anyhow::Result<()> {
         let python = match &self.python {
             Some(python) => python.clone(),
@@ -116,7 +121,7 @@ impl Export {
         };
         let found = verify(&self.output, runtime, &python, expected)?;
         print(&format!(
-            "{}, largest deviation: of the batch's largest value / of the value itself, sqrt(x^2 + 0.001)",
+            "{}: largest deviation, relative to the batch's largest value and to sqrt(x^2 + 0.001) of each value x",
             found.runtime
         ))?;
         for deviation in &found.deviations {
@@ -130,7 +135,7 @@ impl Export {
         let path: &Path = &self.output;
         anyhow::ensure!(
             passes,
-            "{}: deviates by more than {TOLERANCE:e} from what this program computes",
+            "{}: deviates by more than {TOLERANCE:e} from this program's output",
             path.display()
         );
         Ok(())

@@ -1,4 +1,4 @@
-//! `demc-infer import`: weights trained elsewhere, back into a file that this program uses.
+//! `demc-infer import`: turns weights from PyTorch into a file for this program.
 
 use std::path::PathBuf;
 
@@ -8,30 +8,29 @@ use demc_infer::{BundleError, BundleFile, Names, Precision};
 
 use super::{not_an_input, print};
 
-/// Import weights that were trained in PyTorch, with the package of python/.
+/// Import weights that were trained in PyTorch with the package of python/.
 ///
-/// Only the tensors are taken from the file; network, statistics, channel layout and step are those of the model that it
-/// started from (--like), or of the file's own header where it has kept it. Every tensor of the network must be there, and no
-/// other, in f32 or f16. The result is read back and compared before success is reported.
+/// Only the tensors come from the file. Network, statistics, channel layout and step come from the
+/// model that training started from (--like), or from the file's own header. The file must have
+/// exactly the network's tensors, in f32 or f16. The result is read back and compared.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer export --model runs/demc --names torch -o demc.safetensors
-  (trained further, and saved with safetensors.torch.save_file(model.state_dict(), \"tuned.safetensors\"))
+  # Train in PyTorch and save with safetensors.torch.save_file(model.state_dict(), \"tuned.safetensors\")
   demc-infer import tuned.safetensors --like runs/demc -o demc-tuned.safetensors")]
-pub struct Import {
-    /// safetensors file with the names of PyTorch, or of Burn
+pub struct Arguments {
+    /// safetensors file with PyTorch's or Burn's names
     #[arg(value_name = "FILE")]
     weights: PathBuf,
-    /// The model that the weights started from: run directory, checkpoint directory or exported file
+    /// The model that training started from: run directory, checkpoint directory or exported file
     #[arg(long, value_name = "MODEL")]
     like: Option<PathBuf>,
-    /// The file to write; an existing one is replaced, but none of those that are read
+    /// Output file. An existing file is replaced, but never an input
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
 }
 
-impl Import {
-    /// Reads, checks, writes, reads back, reports.
+impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let like = match &self.like {
             Some(path) => Some(BundleFile::read(path)?),
@@ -46,7 +45,7 @@ impl Import {
         let file = match BundleFile::import(&self.weights, like.map(|like| like.meta)) {
             Err(error @ BundleError::Foreign { .. }) if !known => {
                 anyhow::bail!(
-                    "{error}; --like MODEL takes them from the model that it started from"
+                    "{error}; --like MODEL takes them from the model that training started from"
                 )
             }
             file => file?,

@@ -1,13 +1,13 @@
-//! Which files a command line means: files, directories, patterns, frame sequences.
+//! Expands input arguments into files: files, directories, glob patterns, frame sequences.
 
 use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use super::Usage;
+use super::UsageError;
 
-/// Frame numbers, first to last: `7` or `1-240`.
+/// Range of frame numbers: `7` or `1-240`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Frames {
     first: u64,
@@ -28,22 +28,25 @@ impl FromStr for Frames {
     }
 }
 
-/// The images of a command line.
+/// The input images of a command line.
 #[derive(Debug)]
 pub struct Inputs {
-    /// In their order.
+    /// The files in the given order.
     pub files: Vec<PathBuf>,
-    /// Whether there are, or could have been, several.
+    /// Whether the arguments can stand for several files.
     pub several: bool,
 }
 
 impl Inputs {
-    /// What `arguments` mean: a file is itself, a directory its `*.exr`, `shot.####.exr` or `shot.%04d.exr` the frames of a
-    /// sequence, `*`, `?` and `[..]` a pattern where no file has such a name.
+    /// Expands `arguments`.
+    ///
+    /// - A file stands for itself, a directory for its `*.exr`.
+    /// - `shot.####.exr` and `shot.%04d.exr` stand for the frames of a sequence.
+    /// - Names with `*`, `?` or `[..]` are glob patterns if no such file exists.
     ///
     /// # Errors
-    /// A directory, a pattern or a sequence without a single file; `frames` without a sequence.
-    pub fn expand(arguments: &[PathBuf], frames: Option<Frames>) -> Result<Self, Usage> {
+    /// A directory, pattern or sequence without files; `frames` without a sequence.
+    pub fn expand(arguments: &[PathBuf], frames: Option<Frames>) -> Result<Self, UsageError> {
         let mut files = Vec::new();
         let mut several = arguments.len() > 1;
         let mut sequences = 0;
@@ -61,24 +64,27 @@ impl Inputs {
                 several = true;
                 pattern(argument)?
             } else {
-                // Reading it says best what is wrong with it.
+                // Reading the file gives the best error.
                 vec![argument.clone()]
             };
             if found.is_empty() {
-                return Err(Usage(format!("{}: no image there", argument.display())));
+                return Err(UsageError(format!(
+                    "{}: no images found",
+                    argument.display()
+                )));
             }
             files.extend(found);
         }
         if frames.is_some() && sequences == 0 {
             let message = "--frames needs a sequence among the inputs, such as shot.####.exr";
-            return Err(Usage(message.into()));
+            return Err(UsageError(message.into()));
         }
         Ok(Self { files, several })
     }
 }
 
-/// The EXR files directly in `path`, by name.
-fn directory(path: &Path) -> Result<Vec<PathBuf>, Usage> {
+/// The EXR files directly in `path`, sorted by name.
+fn directory(path: &Path) -> Result<Vec<PathBuf>, UsageError> {
     let mut files: Vec<PathBuf> = entries(path)?
         .into_iter()
         .filter(|file| is_exr(file) && file.is_file())
@@ -87,8 +93,8 @@ fn directory(path: &Path) -> Result<Vec<PathBuf>, Usage> {
     Ok(files)
 }
 
-fn entries(path: &Path) -> Result<Vec<PathBuf>, Usage> {
-    let error = |error| Usage(format!("{}: {error}", path.display()));
+fn entries(path: &Path) -> Result<Vec<PathBuf>, UsageError> {
+    let error = |error| UsageError(format!("{}: {error}", path.display()));
     let entries = fs::read_dir(path).map_err(error)?;
     let paths = entries.map(|entry| entry.map(|entry| entry.path()));
     paths.collect::<Result<_, _>>().map_err(error)
@@ -103,9 +109,10 @@ fn is_pattern(path: &Path) -> bool {
     path.to_string_lossy().contains(['*', '?', '['])
 }
 
-/// The files that a pattern finds, by name.
-fn pattern(argument: &Path) -> Result<Vec<PathBuf>, Usage> {
-    let error = |error: &dyn std::fmt::Display| Usage(format!("{}: {error}", argument.display()));
+/// The files that match a pattern, sorted by name.
+fn pattern(argument: &Path) -> Result<Vec<PathBuf>, UsageError> {
+    let error =
+        |error: &dyn std::fmt::Display| UsageError(format!("{}: {error}", argument.display()));
     let found = glob::glob(&argument.to_string_lossy()).map_err(|source| error(&source))?;
     let mut files = Vec::new();
     for path in found {
@@ -117,17 +124,17 @@ fn pattern(argument: &Path) -> Result<Vec<PathBuf>, Usage> {
     Ok(files)
 }
 
-/// `directory/PREFIX####SUFFIX`.
+/// A frame sequence: `directory/PREFIX####SUFFIX`.
 struct Sequence<'a> {
     argument: &'a Path,
     prefix: String,
-    /// Digits of a frame number, leading zeros included.
+    /// Number of digits of a frame number with leading zeros.
     digits: usize,
     suffix: String,
 }
 
 impl<'a> Sequence<'a> {
-    /// A file name with `#`s or a `%0Nd` in it.
+    /// Parses a file name with `#`s or a `%0Nd`.
     fn parse(argument: &'a Path) -> Option<Self> {
         let name = argument.file_name()?.to_str()?;
         let (start, end, digits) = hashes(name).or_else(|| percent(name))?;
@@ -139,8 +146,8 @@ impl<'a> Sequence<'a> {
         })
     }
 
-    /// The frames that are there, by number; of those between `frames`, where given.
-    fn files(&self, frames: Option<Frames>) -> Result<Vec<PathBuf>, Usage> {
+    /// The existing frames, sorted by number and limited to `frames`.
+    fn files(&self, frames: Option<Frames>) -> Result<Vec<PathBuf>, UsageError> {
         let parent = match self.argument.parent() {
             Some(parent) if parent != Path::new("") => parent,
             _ => Path::new("."),
@@ -159,7 +166,7 @@ impl<'a> Sequence<'a> {
         Ok(found.into_iter().map(|(_, path)| path).collect())
     }
 
-    /// The number of the frame of this name: as many digits, or more without a leading zero.
+    /// The frame number in a file name: exactly `digits` digits, or more without a leading zero.
     fn number(&self, name: &str) -> Option<u64> {
         let digits = name
             .strip_prefix(&self.prefix)?
@@ -190,7 +197,7 @@ fn percent(name: &str) -> Option<(usize, usize, usize)> {
     (name[..end].ends_with('d')).then(|| (start, end, width.parse().unwrap_or(1)))
 }
 
-/// How many frames are missing between the first and the last.
+/// A message about missing frames between the first and the last.
 fn missing(found: &[(u64, PathBuf)], frames: Option<Frames>) -> Option<String> {
     let first = frames.map_or(found.first()?.0, |frames| frames.first);
     let last = frames.map_or(found.last()?.0, |frames| frames.last);
@@ -219,13 +226,13 @@ mod tests {
     }
 
     #[test]
-    fn a_directory_is_its_images_by_name() {
+    fn a_directory_stands_for_its_images_by_name() {
         let dir = directory_of(&["b.exr", "a.EXR", "c.txt"]);
         assert_eq!(names(&dir, "", None), ["a.EXR", "b.exr"]);
     }
 
     #[test]
-    fn a_sequence_is_its_frames_by_number() {
+    fn a_sequence_stands_for_its_frames_by_number() {
         let dir = directory_of(&[
             "s.0009.exr",
             "s.0010.exr",
@@ -258,7 +265,7 @@ mod tests {
         let dir = directory_of(&["a.txt"]);
         for argument in ["", "*.exr", "s.####.exr"] {
             let error = Inputs::expand(&[dir.path().join(argument)], None).expect_err("nothing");
-            assert!(error.to_string().ends_with("no image there"), "{error}");
+            assert!(error.to_string().ends_with("no images found"), "{error}");
         }
         let absent = dir.path().join("absent.exr");
         let found = Inputs::expand(std::slice::from_ref(&absent), None).expect("as it is");

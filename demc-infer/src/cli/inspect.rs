@@ -1,4 +1,4 @@
-//! `demc-infer inspect`: what a model is, what it was trained on, what files it takes.
+//! `demc-infer inspect`: shows a model's network, statistics and channel layout.
 
 use std::fmt::Write;
 use std::path::PathBuf;
@@ -11,19 +11,20 @@ use demc_data::layout::Missing;
 use demc_infer::{Bundle, BundleMeta, Names, Precision};
 use serde::Serialize;
 
-use super::{Model, print};
+use super::flags::ModelFlag;
+use super::print;
 
-/// Show a model: network, training step, statistics, and the channels that it reads.
+/// Show a model: network, training step, statistics and input channels.
 ///
-/// Everything is checked on the way: a model that `inspect` shows can be used.
+/// The model is validated completely: a model that `inspect` shows is usable.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer inspect --model runs/quickstart
   demc-infer inspect --model demc.safetensors --json | jq .normalizer")]
-pub struct Inspect {
+pub struct Arguments {
     #[command(flatten)]
-    model: Model,
-    /// List the tensors, too
+    model: ModelFlag,
+    /// Also list the tensors
     #[arg(long)]
     tensors: bool,
     /// Print JSON
@@ -31,37 +32,34 @@ pub struct Inspect {
     json: bool,
 }
 
-/// What is shown.
 #[derive(Serialize)]
-struct Summary {
+struct ModelSummary {
     file: PathBuf,
     #[serde(flatten)]
     meta: BundleMeta,
     names: Names,
     precision: Precision,
     /// Number of trainable values.
-    parameters: usize,
-    /// Name and shape.
+    parameters: u64,
+    /// Names and shapes.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     tensors: Vec<(String, Vec<usize>)>,
 }
 
-impl Inspect {
-    /// Loads the model as every other command does, and prints what it is.
+impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let source = self.model.read()?;
         let (file, names, precision) = (source.path.clone(), source.names, source.precision);
-        let Bundle { meta, model } = source.into_bundle(&Device::flex())?;
+        let Bundle { meta, .. } = source.into_bundle(&Device::flex())?;
+        let specs = meta.model.weight_specs().into_iter();
         let tensors = match self.tensors {
-            true => model
-                .weights()
-                .into_iter()
-                .map(|w| (names.from_burn(&w.name), w.shape))
+            true => specs
+                .map(|spec| (names.in_file(&spec), spec.shape))
                 .collect(),
             false => Vec::new(),
         };
-        let parameters = model.parameter_count();
-        let summary = Summary {
+        let parameters = meta.model.parameter_count();
+        let summary = ModelSummary {
             file,
             meta,
             names,
@@ -76,7 +74,7 @@ impl Inspect {
     }
 }
 
-impl Summary {
+impl ModelSummary {
     fn text(&self) -> Result<String, std::fmt::Error> {
         let Self { meta, .. } = self;
         let mut text = String::new();
@@ -88,7 +86,9 @@ impl Summary {
         let style = format!("{:?}, {:?} names", self.precision, self.names);
         writeln!(t, "weights     {}", style.to_lowercase())?;
         writeln!(t, "gamma       {}", meta.normalizer.gamma)?;
-        writeln!(t, "demodulate  {}", meta.normalizer.demodulate)?;
+        let epsilon = meta.normalizer.albedo_demodulation_epsilon;
+        let demodulation = epsilon.map_or("off".into(), |epsilon| format!("albedo + {epsilon}"));
+        writeln!(t, "demodulate  {demodulation}")?;
 
         writeln!(t, "\n| feature    |         mean | standard deviation |")?;
         writeln!(t, "| ---------- | -----------: | -----------------: |")?;
@@ -102,7 +102,7 @@ impl Summary {
 
         writeln!(
             t,
-            "\n| buffer     | channels                             | where missing  |"
+            "\n| buffer     | channels                             | if missing     |"
         )?;
         writeln!(
             t,
@@ -123,7 +123,7 @@ impl Summary {
     }
 }
 
-/// The buffers that a layout reads: name, channels, and what a file without them gets.
+/// The buffers of a layout: name, channels, and the replacement for missing channels.
 fn buffers(layout: &ChannelLayout) -> Vec<(&'static str, String, &'static str)> {
     let channels =
         |names: Option<&[String; 3]>| names.map_or("none".into(), |names| names.join(" "));

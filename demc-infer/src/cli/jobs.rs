@@ -1,11 +1,11 @@
-//! Which image goes where, and which are done already.
+//! Pairs inputs with outputs and skips finished ones.
 
 use std::collections::HashMap;
 use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::Usage;
+use super::UsageError;
 use super::inputs::Inputs;
 
 /// One image to denoise.
@@ -16,32 +16,34 @@ pub struct Job {
 }
 
 impl Job {
-    /// Where its preview goes.
     pub fn preview(&self) -> PathBuf {
         self.output.with_extension("png")
     }
 }
 
-/// The images of a command line.
+/// All images of a command line.
 #[derive(Debug)]
 pub struct Jobs {
     pub list: Vec<Job>,
     /// Whether the outputs go to a directory.
     pub directory: bool,
-    /// How many are not on the list, since they are done.
+    /// Number of finished images, which are not in the list.
     pub skipped: usize,
 }
 
 impl Jobs {
-    /// Where each input goes. Refuses, before anything is read, two inputs for one output and an output that is an input.
-    pub fn new(inputs: &Inputs, output: &Path) -> Result<Self, Usage> {
+    /// Chooses an output for each input, before anything is read.
+    ///
+    /// # Errors
+    /// Two inputs with the same output, or an output that is an input.
+    pub fn new(inputs: &Inputs, output: &Path) -> Result<Self, UsageError> {
         let named_as_directory = output
             .as_os_str()
             .to_string_lossy()
             .ends_with(std::path::is_separator);
         let directory = inputs.several || output.is_dir() || named_as_directory;
         if directory && output.exists() && !output.is_dir() {
-            return Err(Usage(format!(
+            return Err(UsageError(format!(
                 "-o {} is a file; {} input(s) need a directory",
                 output.display(),
                 inputs.files.len()
@@ -52,9 +54,9 @@ impl Jobs {
         for input in &inputs.files {
             let name = input
                 .file_name()
-                .ok_or_else(|| Usage(format!("{} names no file", input.display())))?;
+                .ok_or_else(|| UsageError(format!("{} has no file name", input.display())))?;
             if let Some(other) = taken.insert(name, input) {
-                return Err(Usage(format!(
+                return Err(UsageError(format!(
                     "{} and {} have the same file name; denoise them into different directories",
                     other.display(),
                     input.display()
@@ -77,7 +79,7 @@ impl Jobs {
             .collect();
         for job in &list {
             if fs::canonicalize(&job.output).is_ok_and(|output| originals.contains(&output)) {
-                return Err(Usage(format!(
+                return Err(UsageError(format!(
                     "output {} would replace an input",
                     job.output.display()
                 )));
@@ -90,14 +92,19 @@ impl Jobs {
         })
     }
 
-    /// Takes off the list what is there: outputs are written whole or not at all, so one that exists is done (and so is its preview,
-    /// where there are `previews`). A single file that exists is an error: nothing would happen.
-    pub fn skip_done(&mut self, previews: bool) -> Result<(), Usage> {
+    /// Removes finished images from the list. Outputs are written atomically, so an existing output
+    /// is finished. With `previews`, its preview must exist, too.
+    ///
+    /// # Errors
+    /// The only output exists, so there is nothing to do.
+    pub fn skip_done(&mut self, previews: bool) -> Result<(), UsageError> {
         if let (false, [job]) = (self.directory, &self.list[..])
             && job.output.exists()
         {
             let output = job.output.display();
-            return Err(Usage(format!("{output} exists; --overwrite replaces it")));
+            return Err(UsageError(format!(
+                "{output} exists; --overwrite replaces it"
+            )));
         }
         let before = self.list.len();
         self.list
@@ -111,7 +118,7 @@ impl Jobs {
 mod tests {
     use super::*;
 
-    fn jobs(files: Vec<PathBuf>, output: &Path) -> Result<Jobs, Usage> {
+    fn jobs(files: Vec<PathBuf>, output: &Path) -> Result<Jobs, UsageError> {
         let several = files.len() > 1;
         Jobs::new(&Inputs { files, several }, output)
     }
@@ -167,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_there_is_skipped_in_a_directory_and_an_error_alone() -> std::io::Result<()> {
+    fn an_existing_output_is_skipped_in_a_directory_and_an_error_alone() -> std::io::Result<()> {
         let dir = tempfile::tempdir()?;
         fs::write(dir.path().join("a.exr"), "")?;
         let inputs = || vec!["x/a.exr".into(), "x/b.exr".into()];

@@ -1,36 +1,36 @@
-//! `demc-infer report`: a page to look at.
+//! `demc-infer report`: writes an HTML report.
 
 use std::io::Write;
 use std::path::PathBuf;
 
 use clap::Args;
-use demc_infer::report::{About, Page};
+use demc_infer::report::{About, ReportPage};
 
 use super::scenes::Scenes;
 
-/// Write one HTML file that shows a model's images beside the noisy ones, the references and other programs', with all
+/// Write an HTML report: denoised images beside noisy, reference and baseline images, with all
 /// metrics.
 ///
-/// The file needs no network and no other file, and stays below 20 MB. Its images are 8-bit JPEG of a logarithmic curve,
-/// so that exposure can be changed by 3 stops to both sides; all numbers are computed from the full images.
+/// The report is one file below 20 MB and needs no network. Its images are 8-bit JPEG with a
+/// logarithmic curve, so that the exposure can be changed by 3 stops in both directions. All
+/// numbers are computed from the full images.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer report --data data/sample -o report.html
   demc-infer report --model runs/quickstart --data data/sample --baseline oidn=oidn/ -o report.html")]
-pub struct Report {
+pub struct Arguments {
     #[command(flatten)]
     scenes: Scenes,
-    /// The page
+    /// Output file
     #[arg(short, long, value_name = "FILE.html")]
     output: PathBuf,
 }
 
-impl Report {
-    /// Scores every scene of the split and writes the page, whole or not at all.
+impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
-        let mut page = Page::default();
+        let mut page = ReportPage::default();
         let report = self.scenes.score(
-            |views, scenes| Ok(views.encode(scenes)?),
+            |images, scenes| Ok(images.encode(scenes)?),
             |encoded, score| Ok(page.add(encoded, score)?),
         )?;
         let about = About {

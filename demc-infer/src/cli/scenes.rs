@@ -1,28 +1,29 @@
-//! What the commands that score a data set have in common: their flags, and the walk over the scenes.
+//! Flags and scoring shared by the commands that score a data set.
 
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use demc_data::{Dataset, Rgb, Scene};
-use demc_infer::report::Views;
+use demc_infer::report::SceneImages;
 use demc_infer::{Baseline, BaselineError, Ensemble, ImageScore, Report, Tiling, baseline};
 
-use super::{Clamped, DeviceFlag, EnsembleFlag, Model, Usage};
-use crate::progress::Progress;
+use super::flags::{DeviceFlag, EnsembleFlag, ModelFlag};
+use super::progress::Progress;
+use super::{Clamped, UsageError};
 
-/// Which model, which scenes, and what to compare with.
+/// The model, the scenes and the baselines.
 #[derive(Args)]
 pub struct Scenes {
     #[command(flatten)]
-    model: Model,
+    model: ModelFlag,
     /// Data set: the directory with manifest.json
     #[arg(long, value_name = "DIR")]
     pub data: PathBuf,
-    /// Which scenes
+    /// Split of the data set
     #[arg(long, value_enum, default_value = "test")]
-    pub split: Split,
-    /// Other images of the same scenes: DIR holds an EXR with channels R, G, B for each scene, with the scene's file
-    /// name. Can be given several times
+    pub split: SplitFlag,
+    /// Images of the same scenes from another program. DIR has one EXR file per scene, with
+    /// channels R, G, B and the scene's file name. The flag can be repeated
     #[arg(long = "baseline", value_name = "NAME=DIR")]
     baselines: Vec<Baseline>,
     #[command(flatten)]
@@ -31,48 +32,49 @@ pub struct Scenes {
     device: DeviceFlag,
 }
 
-/// A part of a data set.
 #[derive(Clone, Copy, ValueEnum)]
-pub enum Split {
+pub enum SplitFlag {
     Train,
     Test,
 }
 
-impl From<Split> for demc_data::Split {
-    fn from(split: Split) -> Self {
+impl From<SplitFlag> for demc_data::Split {
+    fn from(split: SplitFlag) -> Self {
         match split {
-            Split::Train => demc_data::Split::Train,
-            Split::Test => demc_data::Split::Test,
+            SplitFlag::Train => demc_data::Split::Train,
+            SplitFlag::Test => demc_data::Split::Test,
         }
     }
 }
 
 impl Scenes {
-    /// What computes the denoised images, for a title.
+    /// The model and the number of passes, for a title.
     pub fn model_name(&self) -> String {
-        let path = self.model.path.as_ref();
-        let name = path.map_or(super::OWN_MODEL_NAME.into(), |path| {
-            path.display().to_string()
-        });
-        match self.ensemble.looks {
+        let name = self.model.name();
+        match self.ensemble.passes {
             Ensemble::One => name,
-            looks => format!("{name}, mean of {} looks", looks.count()),
+            passes => format!("{name}, mean of {} passes", passes.count()),
         }
     }
 
-    /// Scores every scene of the split in all metrics, one in memory at a time. `beside` sees its images and the number of all
-    /// scenes while they are scored, and `each` gets what that made. The first that fails ends it: a mean over fewer would mislead.
+    /// Scores every scene of the split in all metrics, with one scene in memory at a time.
+    ///
+    /// In parallel with the scoring, `process` gets the scene's images and the number of all
+    /// scenes. Its result and the scores go to `finish`. A failure ends the run, because a mean
+    /// over fewer scenes would mislead.
     pub fn score<T: Send>(
         &self,
-        beside: impl Fn(&Views, usize) -> anyhow::Result<T> + Sync,
-        mut each: impl FnMut(T, &ImageScore) -> anyhow::Result<()>,
+        process: impl Fn(&SceneImages, usize) -> anyhow::Result<T> + Sync,
+        mut finish: impl FnMut(T, &ImageScore) -> anyhow::Result<()>,
     ) -> anyhow::Result<Report> {
         let bundle = self.model.load_onto(&self.device)?;
         let layout = &bundle.meta.layout;
         let dataset = Dataset::open(&self.data, layout)?;
         let scenes = dataset.split(self.split.into())?;
         baseline::check(&self.baselines, &scenes).map_err(|error| match error {
-            BaselineError::Taken(_) => anyhow::Error::new(Usage(format!("--baseline {error}"))),
+            BaselineError::Taken(_) => {
+                anyhow::Error::new(UsageError(format!("--baseline {error}")))
+            }
             other => other.into(),
         })?;
         let progress = Progress::new(scenes.len());
@@ -91,20 +93,21 @@ impl Scenes {
                 .map(|(baseline, image)| (baseline.name.as_str(), image.planes.as_slice()))
                 .collect();
             let tiling = Tiling::default();
-            let denoised = bundle.denoise_tiled(&frame, &tiling, self.ensemble.looks, |_, _| ())?;
+            let denoised =
+                bundle.denoise_tiled(&frame, &tiling, self.ensemble.passes, |_, _| ())?;
             let denoised = denoised.color_hdr;
             let residual = scene.ref_residual_relmse;
-            let views = Views {
+            let scene_images = SceneImages {
                 frame: &frame,
                 denoised: &denoised,
                 baselines: &others,
             };
-            let (score, made) = rayon::join(
+            let (score, processed) = rayon::join(
                 || ImageScore::full(&frame, &denoised, &others, residual),
-                || beside(&views, scenes.len()),
+                || process(&scene_images, scenes.len()),
             );
             let score = score?;
-            each(made?, &score)?;
+            finish(processed?, &score)?;
             images.push(score);
             progress.advance();
         }

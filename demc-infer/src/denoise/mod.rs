@@ -1,6 +1,6 @@
-//! A frame to its denoised image: padding and tiles, gamma, demodulation and Z-score, the network, back to linear HDR.
+//! Denoises a frame: padding and tiles, gamma, albedo demodulation and Z-score, the network, and
+//! back to linear HDR.
 
-mod error;
 mod seams;
 #[cfg(test)]
 mod tests;
@@ -12,11 +12,12 @@ use demc_model::config::COLOR_CHANNELS;
 
 use crate::Bundle;
 use crate::ensemble::Ensemble;
+use crate::error::check_sizes;
 use crate::memory;
 use crate::padding::Padding;
 use crate::tiles::{Tiles, Tiling};
 
-pub use error::DenoiseError;
+pub use crate::error::DenoiseError;
 pub use seams::SeamError;
 
 /// A denoised image, and how it was made.
@@ -24,28 +25,34 @@ pub use seams::SeamError;
 pub struct Denoised {
     /// Planar `[3, H, W]`, linear HDR, not negative.
     pub color_hdr: Vec<f32>,
-    /// How the image was cut.
+    /// The tiles that the image was cut into.
     pub tiles: Tiles,
-    /// What a halo that is too small costs, measured at seams; none where the tiles are exact or one.
+    /// The error of a halo below the exact one, measured at seams; `None` for exact tiles or a
+    /// single tile.
     pub seam_error: Option<SeamError>,
 }
 
 impl Bundle {
-    /// Denoises `frame`, whatever its size, as one image: whole where memory allows, else in tiles that equal it
-    /// ([`crate::tiles`]). It is padded by edge replication to multiples of 32, then cropped.
+    /// Denoises `frame`, which can have any size.
+    ///
+    /// The image is processed whole if memory allows, otherwise in tiles with the same result
+    /// ([`crate::tiles`]). It is padded by edge replication to multiples of 32 and cropped
+    /// afterwards.
     ///
     /// # Shapes
     /// Returns planar `[3, H, W]` in linear HDR, not negative.
     ///
     /// # Errors
-    /// As [`check_statistics`](Self::check_statistics); an image of which not even a tile fits into the memory that is there; a
-    /// device that fails, an output that is not finite.
+    /// As [`check_statistics`](Self::check_statistics). Further: the smallest tile does not fit
+    /// into the available memory, the device fails, or the output is not finite.
     pub fn denoise(&self, frame: &Frame) -> Result<Vec<f32>, DenoiseError> {
         self.denoise_tiled(frame, &Tiling::default(), Ensemble::One, |_, _| ())
             .map(|denoised| denoised.color_hdr)
     }
 
-    /// The same, cut as `tiling` says and looked at as often as `ensemble` does; `progress` hears how many of how many tiles are done.
+    /// As [`denoise`](Self::denoise), with a choice of tiles and of test-time augmentation.
+    ///
+    /// `progress` is called before each tile with the number of finished tiles and of all tiles.
     ///
     /// # Errors
     /// As [`denoise`](Self::denoise).
@@ -56,9 +63,9 @@ impl Bundle {
         ensemble: Ensemble,
         progress: impl FnMut(usize, usize),
     ) -> Result<Denoised, DenoiseError> {
-        let input = Input {
+        let input = FrameInput {
             ensemble,
-            ..Input::new(self, frame)?
+            ..FrameInput::new(self, frame)?
         };
         self.check_statistics(frame)?;
         let tiles = self
@@ -79,10 +86,11 @@ impl Bundle {
         })
     }
 
-    /// How [`denoise_tiled`](Self::denoise_tiled) would cut an image of `height` x `width` pixels now.
+    /// The tiles that [`denoise_tiled`](Self::denoise_tiled) would cut an image of `height` x
+    /// `width` pixels into now.
     ///
     /// # Errors
-    /// If not even the smallest tile fits into memory.
+    /// The smallest tile does not fit into memory.
     pub fn tiles(
         &self,
         height: usize,
@@ -96,30 +104,30 @@ impl Bundle {
             let output = (COLOR_CHANNELS * height * width * size_of::<f32>()) as u64;
             Some(self.memory_budget()?.saturating_sub(output))
         });
-        let modulation = match self.meta.normalizer.demodulate > 0.0 {
-            true => (COLOR_CHANNELS * size_of::<f32>()) as u64,
-            false => 0,
+        let modulation = match self.meta.normalizer.albedo_demodulation_epsilon {
+            Some(_) => (COLOR_CHANNELS * size_of::<f32>()) as u64,
+            None => 0,
         };
-        let beside =
+        let extra =
             modulation + ensemble.bytes_per_pixel(COLOR_CHANNELS + FEATURES, COLOR_CHANNELS);
-        let need =
-            |height, width| self.pass_bytes(height, width) + beside * (height * width) as u64;
+        let need = |height, width| self.pass_bytes(height, width) + extra * (height * width) as u64;
         Tiles::plan(padded, tiling, need, budget)
     }
 
-    /// Bytes that a pass over `height` x `width` pixels, multiples of 32, takes beside the network.
+    /// Bytes that a pass over `height` x `width` pixels (multiples of 32) needs in addition to the
+    /// weights.
     pub fn pass_bytes(&self, height: usize, width: usize) -> u64 {
         let ops = self.model.ops().on(&self.device());
-        memory::pass_bytes(ops, self.model.config(), height, width)
+        demc_model::inference::pass_bytes(ops, self.model.config(), height, width)
     }
 
-    /// Bytes that a pass may take now on the model's device; none where nothing is known.
+    /// Bytes that a pass may use now on the model's device; `None` if unknown.
     pub fn memory_budget(&self) -> Option<u64> {
         memory::budget(&self.device())
     }
 
-    /// What the fusion sub-network makes of the frame's features (Fig. 2 e), to look at; `None` for a variant
-    /// without it.
+    /// The detail map of the fusion sub-network (Fig. 2 e), for inspection; `None` for a variant
+    /// without one.
     ///
     /// # Shapes
     /// Planar `[3, H, W]`, not negative, without a unit.
@@ -127,22 +135,22 @@ impl Bundle {
     /// # Errors
     /// As [`denoise`](Self::denoise).
     pub fn detail_map(&self, frame: &Frame) -> Result<Option<Vec<f32>>, DenoiseError> {
-        let input = Input::new(self, frame)?;
+        let input = FrameInput::new(self, frame)?;
         let (height, width) = (input.padding.padded_height(), input.padding.padded_width());
         let map = self.model.detail_map(input.features_z(0..height, 0..width));
         let map = map.map(|map| input.read(map)).transpose()?;
         Ok(map.map(|map| input.padding.crop(&map)))
     }
 
-    /// Where the model is.
+    /// The device that holds the model.
     pub(crate) fn device(&self) -> Device {
         let devices = self.model.devices();
         devices.first().expect("every network has weights").clone()
     }
 }
 
-/// A frame on its way into a network.
-struct Input<'a> {
+/// A frame, and how it is fed into the network.
+struct FrameInput<'a> {
     bundle: &'a Bundle,
     frame: &'a Frame,
     padding: Padding,
@@ -151,10 +159,10 @@ struct Input<'a> {
 }
 
 /// Rows or columns of the padded image, in pixels.
-type Pixels = std::ops::Range<usize>;
+type PixelRange = std::ops::Range<usize>;
 
-impl<'a> Input<'a> {
-    /// Of a frame whose buffers have its size.
+impl<'a> FrameInput<'a> {
+    /// The input of one pass; fails for buffers of the wrong size.
     fn new(bundle: &'a Bundle, frame: &'a Frame) -> Result<Self, DenoiseError> {
         check_sizes(frame)?;
         Ok(Self {
@@ -169,7 +177,10 @@ impl<'a> Input<'a> {
         })
     }
 
-    /// Planar `[3, H, W]` in linear HDR, tile by tile.
+    /// Denoises tile by tile.
+    ///
+    /// # Shapes
+    /// Returns planar `[3, H, W]` in linear HDR.
     fn denoise(
         &self,
         tiles: &Tiles,
@@ -192,8 +203,11 @@ impl<'a> Input<'a> {
         }
     }
 
-    /// One pass through the network for each look: `[3, rows, columns]` in linear HDR, NaN where the network's output is.
-    fn tile(&self, rows: &Pixels, columns: &Pixels) -> Result<Vec<f32>, DenoiseError> {
+    /// Denoises one tile. NaN in the network's output stays NaN.
+    ///
+    /// # Shapes
+    /// Returns `[3, rows, columns]` in linear HDR.
+    fn tile(&self, rows: &PixelRange, columns: &PixelRange) -> Result<Vec<f32>, DenoiseError> {
         let normalizer = &self.bundle.meta.normalizer;
         let frame = self.frame;
         let mut color = self
@@ -213,7 +227,7 @@ impl<'a> Input<'a> {
                 self.bundle.model.forward(color, features)
             });
         let mut out = self.read(out)?;
-        // Going back to HDR would turn NaN into 0.
+        // The conversion to HDR would turn NaN into 0.
         let nan: Vec<usize> = (0..out.len()).filter(|i| out[*i].is_nan()).collect();
         normalizer.color_hdr_from_gamma(&mut out, modulation.as_deref());
         nan.into_iter().for_each(|i| out[i] = f32::NAN);
@@ -221,7 +235,7 @@ impl<'a> Input<'a> {
     }
 
     /// Z-scored features, `[1, 12, rows, columns]`.
-    fn features_z(&self, rows: Pixels, columns: Pixels) -> Tensor<4> {
+    fn features_z(&self, rows: PixelRange, columns: PixelRange) -> Tensor<4> {
         let mut planes = self
             .padding
             .cut(&self.frame.features, rows.clone(), columns.clone());
@@ -232,8 +246,8 @@ impl<'a> Input<'a> {
     fn tensor<const CHANNELS: usize>(
         &self,
         planes: Vec<f32>,
-        rows: &Pixels,
-        columns: &Pixels,
+        rows: &PixelRange,
+        columns: &PixelRange,
     ) -> Tensor<4> {
         let shape = [1, CHANNELS, rows.len(), columns.len()];
         Tensor::from_data(TensorData::new(planes, shape), &self.device)
@@ -246,28 +260,4 @@ impl<'a> Input<'a> {
                 source,
             })
     }
-}
-
-/// Checks that the frame's buffers have its size.
-pub(crate) fn check_sizes(frame: &Frame) -> Result<(), DenoiseError> {
-    let Frame { width, height, .. } = *frame;
-    let checks = [
-        ("color", frame.color.len(), COLOR_CHANNELS),
-        ("features", frame.features.len(), FEATURES),
-    ];
-    let mask = frame.mask.as_ref().map(|mask| ("mask", mask.len(), 1));
-    for (buffer, found, channels) in checks.into_iter().chain(mask) {
-        let expected = channels * width * height;
-        if found != expected || expected == 0 {
-            return Err(DenoiseError::Size {
-                name: frame.name.clone(),
-                buffer,
-                found,
-                expected,
-                width,
-                height,
-            });
-        }
-    }
-    Ok(())
 }

@@ -1,31 +1,32 @@
-//! What a halo below the exact one costs, measured where it shows: small windows at seams, denoised once more with the exact halo.
+//! The error of a halo below the exact one, measured in small windows at seams that are denoised
+//! again with the exact halo.
 
 use crate::padding::Padding;
 use crate::tiles::{EXACT_HALO, Span, Tiles};
 use demc_model::DOWNSAMPLING;
 use demc_model::metrics::rel_mse_image;
 
-use super::{DenoiseError, Input, Pixels};
+use super::{DenoiseError, FrameInput, PixelRange};
 
 /// Side of a window in pixels, a multiple of 32.
 const WINDOW: usize = 64;
 
-/// Most windows: of a regular share of the seams.
+/// Largest number of windows, spread evenly over the seams.
 const WINDOWS: usize = 4;
 
-/// How far an image of tiles with a small halo is from the exact one, at its seams.
+/// Difference between an image from tiles with a small halo and the exact one, at seams.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SeamError {
-    /// RelMSE (Eq. 5) of the windows' pixels, with the exact image as reference.
+    /// RelMSE (Eq. 5) over the windows' pixels, with the exact image as reference.
     pub relmse: f64,
-    /// Largest difference of a value, as a share of the largest exact value of its window.
+    /// Largest difference of a value, relative to the largest exact value in its window.
     pub largest: f64,
-    /// Windows of 64x64 pixels that were compared.
+    /// Number of compared windows of 64x64 pixels.
     pub windows: usize,
 }
 
-impl Input<'_> {
-    /// Denoises windows at some seams exactly and compares; none if there are no seams.
+impl FrameInput<'_> {
+    /// Denoises windows at some seams exactly and compares; `None` without seams.
     pub(super) fn seam_error(
         &self,
         tiles: &Tiles,
@@ -48,7 +49,7 @@ impl Input<'_> {
                 height: rows.read.len(),
                 width: columns.read.len(),
             };
-            let inside = |range: &Pixels, span: &Span| {
+            let inside = |range: &PixelRange, span: &Span| {
                 range.start - span.read.start..range.end - span.read.start
             };
             let exact = within.cut(&tile, inside(&y, rows), inside(&x, columns));
@@ -63,23 +64,23 @@ impl Input<'_> {
     }
 }
 
-/// Windows around seams: where rows and columns of tiles meet, or in the middle of an axis without seams.
+/// Windows around the crossings of row and column seams; an axis without seams uses its middle.
 fn windows(tiles: &Tiles, padding: Padding) -> Vec<(Span, Span)> {
     let sides = (padding.padded_height(), padding.padded_width());
-    let rows = places(&tiles.rows, sides.0);
-    let columns = places(&tiles.columns, sides.1);
+    let rows = seam_spans(&tiles.rows, sides.0);
+    let columns = seam_spans(&tiles.columns, sides.1);
     if tiles.count() == 1 {
         return Vec::new();
     }
     let count = rows.len().max(columns.len()).min(WINDOWS);
-    let pick = |places: &[Span], i: usize| places[i * places.len() / count].clone();
+    let pick = |spans: &[Span], i: usize| spans[i * spans.len() / count].clone();
     (0..count)
         .map(|i| (pick(&rows, i), pick(&columns, i)))
         .collect()
 }
 
 /// Windows over the seams of an axis of `length` pixels, each with the exact halo.
-fn places(spans: &[Span], length: usize) -> Vec<Span> {
+fn seam_spans(spans: &[Span], length: usize) -> Vec<Span> {
     let middle = length / 2 / DOWNSAMPLING * DOWNSAMPLING;
     let seams = match spans {
         [_] => vec![middle],

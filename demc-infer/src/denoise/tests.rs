@@ -1,4 +1,4 @@
-//! A narrow network on frames with a pattern.
+//! Tests with a narrow network on frames with a pattern.
 
 use demc_data::Frame;
 use demc_model::Variant;
@@ -6,7 +6,7 @@ use demc_model::Variant;
 use super::*;
 use crate::bundle::testing::{bundle, frame};
 
-/// The largest difference of two images, as a share of the largest value of the second.
+/// Largest difference of two images, relative to the largest value of the second.
 fn difference(image: &[f32], expected: &[f32]) -> f32 {
     assert_eq!(image.len(), expected.len());
     assert!(image.iter().all(|x| x.is_finite()));
@@ -16,7 +16,7 @@ fn difference(image: &[f32], expected: &[f32]) -> f32 {
 }
 
 #[test]
-fn every_size_gives_an_image_of_its_own_size() {
+fn outputs_have_the_size_of_their_inputs() {
     let bundle = bundle(Variant::Demc);
     for (width, height) in [(1, 1), (31, 33), (64, 32), (5, 70)] {
         let out = bundle.denoise(&frame(width, height)).expect("denoised");
@@ -44,12 +44,13 @@ fn padding_equals_an_image_padded_by_hand() {
     assert_eq!(bundle.denoise(&small).expect("small"), expected);
 }
 
-/// A demodulating network is the same network on colour that was divided by hand, in tiles and ensembles, too.
+/// Albedo demodulation equals dividing the input and multiplying the output by hand, also with
+/// tiles and test-time augmentation.
 #[test]
 fn demodulation_equals_a_division_by_hand() {
     let plain = bundle(Variant::Demc);
     let mut demodulating = bundle(Variant::Demc);
-    demodulating.meta.normalizer.demodulate = 0.07;
+    demodulating.meta.normalizer.albedo_demodulation_epsilon = Some(0.07);
     let frame = frame(70, 100);
     let (texture, pixels) = (demc_data::frame::TEXTURES, 70 * 100);
     let textures = &frame.features[texture * pixels..(texture + 3) * pixels];
@@ -110,7 +111,8 @@ fn buffers_that_do_not_fit_are_named() {
     );
 }
 
-/// The whole image, and tiles of it: the same to the rounding of float32 sums. Odd sizes, so that padding and tiles meet.
+/// Tiles give the whole image up to float32 rounding. Sizes are odd, so that padding and tiles
+/// interact.
 #[test]
 fn tiles_with_the_exact_halo_are_the_whole_image() {
     for variant in [Variant::Demc, Variant::DemcNosn, Variant::Semc] {
@@ -132,7 +134,7 @@ fn tiles_with_the_exact_halo_are_the_whole_image() {
     }
 }
 
-/// The halo is as large as it must be and no larger than the network's grid makes it: with 32 pixels less it shows.
+/// The exact halo is the smallest on the network's grid: with 32 pixels less, the result differs.
 #[test]
 fn a_smaller_halo_is_measured_and_is_worse() {
     let bundle = bundle(Variant::Demc);
@@ -195,7 +197,8 @@ fn every_tile_is_announced() {
     assert_eq!(heard, [(0, 4), (1, 4), (2, 4), (3, 4)]);
 }
 
-/// With rows as columns an ensemble of eight is the same image, up to the order of sums; a single look is another one.
+/// Eight passes give the same image for a transposed input, up to the order of sums; one pass does
+/// not.
 #[test]
 fn an_ensemble_does_not_mind_how_an_image_is_held() {
     let bundle = bundle(Variant::Demc);

@@ -1,4 +1,5 @@
-//! Paired differences of the denoised image from another, image by image, with a bootstrap interval.
+//! Paired differences between the denoised image and another, with a bootstrap interval over
+//! images.
 
 use demc_model::metrics::METRICS;
 use serde::Serialize;
@@ -6,30 +7,31 @@ use serde::Serialize;
 use super::{ImageScore, Report, Score};
 use crate::statistics::Estimate;
 
-/// Below this many images a bootstrap interval is known to be too narrow (Hesterberg 2015), and it is said.
+/// Number of images below which a bootstrap interval is too narrow (Hesterberg 2015). Reports say
+/// so.
 pub const FEW_IMAGES: usize = 10;
 
-/// The mean difference of the denoised image from another in one metric.
+/// The mean difference between the denoised image and another in one metric.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Difference {
-    /// What the denoised image is compared with.
+    /// The other image's name.
     pub against: String,
-    /// The metric's name. Of `energy-bias`, distances from zero are compared.
+    /// The metric's name. For `energy-bias`, distances from zero are compared.
     pub metric: &'static str,
-    /// Images that both have a score of.
+    /// Number of images with a score for both.
     pub images: usize,
     /// Denoised minus the other, and its 95 % interval over images.
     #[serde(flatten)]
     pub estimate: Estimate,
-    /// Whether zero lies outside of the interval.
+    /// Whether the interval excludes zero.
     pub significant: bool,
-    /// The same in words.
+    /// The result as text.
     pub verdict: String,
 }
 
 impl Report {
-    /// Differences of the denoised image from the noisy one and from each baseline, in every metric that both have on two
-    /// images or more: one image says nothing of others.
+    /// Differences between the denoised image and the noisy one and each baseline, in every metric
+    /// that both have on at least two images.
     pub fn differences(&self) -> Vec<Difference> {
         let others = self.mean.methods().into_iter().map(|(name, _)| name);
         let others = others.filter(|name| !matches!(*name, "black" | "denoised"));
@@ -61,20 +63,24 @@ impl Report {
             .collect()
     }
 
-    /// What the differences from the baselines say in `metrics`, a sentence a baseline; none without baselines.
+    /// One sentence per baseline about the differences in `metrics`; empty without baselines.
     pub fn sentences(&self, metrics: &[&str]) -> Vec<String> {
         let differences = self.differences();
         let sentence = |name: &String| {
-            let of_it = differences.iter().filter(|d| d.against == *name);
-            let asked: Vec<_> = of_it.filter(|d| metrics.contains(&d.metric)).collect();
-            let Some(first) = asked.first() else {
-                return format!("denoised against {name}: one image says nothing of others");
+            let selected: Vec<_> = differences
+                .iter()
+                .filter(|d| d.against == *name && metrics.contains(&d.metric))
+                .collect();
+            let Some(first) = selected.first() else {
+                return format!("denoised against {name}: one image gives no interval");
             };
             let few = match first.images {
-                ..FEW_IMAGES => "; so few images give intervals that are too narrow",
-                _ => "",
+                ..FEW_IMAGES => {
+                    format!("; intervals from fewer than {FEW_IMAGES} images are too narrow")
+                }
+                _ => String::new(),
             };
-            let verdicts: Vec<_> = asked.iter().map(|d| d.verdict.as_str()).collect();
+            let verdicts: Vec<_> = selected.iter().map(|d| d.verdict.as_str()).collect();
             format!(
                 "denoised against {name}, {} images: {}{few}",
                 first.images,
@@ -107,14 +113,15 @@ mod tests {
     fn a_constant_difference_is_significant_and_a_mixed_one_is_not() {
         let better = report(&[(1.0, 1.5), (3.0, 3.5), (9.0, 9.5)]);
         let found = better.differences();
-        let of_other = found.iter().find(|d| d.against == "other").expect("relmse");
-        assert_eq!((of_other.metric, of_other.images), ("relmse", 3));
-        assert_eq!(of_other.estimate.mean, -0.5);
-        assert!(of_other.significant);
+        let other = found.iter().find(|d| d.against == "other").expect("relmse");
+        assert_eq!((other.metric, other.images), ("relmse", 3));
+        assert_eq!(other.estimate.mean, -0.5);
+        assert!(other.significant);
         assert_eq!(
             better.sentences(&["relmse"]),
             [
-                "denoised against other, 3 images: better in relmse (-0.5000, 95 % -0.5000 to -0.5000); so few images give intervals that are too narrow"
+                "denoised against other, 3 images: better in relmse (-0.5000, 95 % -0.5000 to -0.5000); \
+                 intervals from fewer than 10 images are too narrow"
             ]
         );
         let mixed = report(&[(1.0, 1.5), (3.0, 2.5), (9.0, 9.1)]);
@@ -131,7 +138,7 @@ mod tests {
         assert_eq!(one.differences(), []);
         let sentence = one.sentences(&["relmse"]).remove(0);
         assert!(
-            sentence.ends_with("one image says nothing of others"),
+            sentence.ends_with("one image gives no interval"),
             "{sentence}"
         );
     }

@@ -1,9 +1,9 @@
-//! Scores of a network: what all metrics say of the noisy, an all-black and the denoised image against the reference,
-//! and of other programs' images of the same scenes.
+//! Scores of a network: all metrics of the noisy image, an all-black image, the denoised image and
+//! baselines against the reference.
 //!
-//! The black image is there because being better than the noisy one proves nothing: at few samples a pixel, black
-//! itself is (about 2.5 to 3 in RelMSE). The reference has an error of its own, the residual; a score near it means
-//! nothing either.
+//! Two numbers put a score into context. At few samples per pixel, a black image already has a
+//! lower RelMSE (about 2.5 to 3) than the noisy one. The reference has an error, the residual; a
+//! score near it has no meaning.
 
 mod difference;
 mod table;
@@ -19,20 +19,22 @@ use crate::Bundle;
 use crate::denoise::DenoiseError;
 pub use difference::{Difference, FEW_IMAGES};
 
-/// How near an image is to its reference.
+/// Distance of an image from its reference.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Score {
-    /// Eq. 5: summed over rgb, averaged over pixels, epsilon 0.001, linear HDR. Smaller is better.
+    /// RelMSE (Eq. 5): summed over rgb, averaged over pixels, epsilon 0.001, linear HDR. Smaller is
+    /// better.
     pub relmse: f64,
-    /// Wang et al. 2004 on `clip(x, 0, 1)^(1 / 2.2)`, at most 1; `None` for an image below its 11x11 window.
+    /// SSIM (Wang et al. 2004) on `clip(x, 0, 1)^(1 / 2.2)`, at most 1; `None` for an image smaller
+    /// than the 11x11 window.
     pub ssim: Option<f64>,
-    /// The other metrics of [`METRICS`] by name, where they were asked for; `None` for one without a value.
+    /// The other metrics of [`METRICS`] by name, if computed; `None` for a metric without a value.
     #[serde(flatten)]
     pub others: BTreeMap<String, Option<f64>>,
 }
 
 impl Score {
-    /// The headlines of `candidate` against `reference`.
+    /// RelMSE and SSIM of `candidate` against `reference`.
     pub fn headline(candidate: &Image, reference: &Image) -> Self {
         Self {
             relmse: metrics::rel_mse(candidate, reference),
@@ -45,7 +47,9 @@ impl Score {
     pub fn full(candidate: &Image, reference: &Image) -> Self {
         candidate.prepare();
         reference.prepare();
-        let values = METRICS.par_iter().map(|m| (m.of)(candidate, reference));
+        let values = METRICS
+            .par_iter()
+            .map(|m| (m.measure)(candidate, reference));
         let values: Vec<Option<f64>> = values.collect();
         let mut others: BTreeMap<String, Option<f64>> = METRICS
             .iter()
@@ -59,7 +63,7 @@ impl Score {
         }
     }
 
-    /// The value of the metric called `name`, where it was asked for and has one.
+    /// The value of the metric `name`; `None` if it was not computed or has no value.
     pub fn get(&self, name: &str) -> Option<f64> {
         match name {
             "relmse" => Some(self.relmse),
@@ -68,12 +72,12 @@ impl Score {
         }
     }
 
-    /// The mean of each number, over the images that have it.
+    /// The mean of each metric over the images with a value.
     fn mean(scores: &[&Score]) -> Self {
-        let average = |of: &dyn Fn(&Score) -> Option<f64>| {
+        let average = |value: &dyn Fn(&Score) -> Option<f64>| {
             let (count, sum) = scores
                 .iter()
-                .filter_map(|score| of(score))
+                .filter_map(|score| value(score))
                 .fold((0.0, 0.0), |(n, sum), value| (n + 1.0, sum + value));
             (count > 0.0).then(|| sum / count)
         };
@@ -99,25 +103,28 @@ fn is_headline(name: &str) -> bool {
 pub struct ImageScore {
     /// The image.
     pub name: String,
-    /// The input.
+    /// Score of the input.
     pub noisy: Score,
-    /// An image of zeros.
+    /// Score of an all-zero image.
     pub black: Score,
-    /// The network's output.
+    /// Score of the network's output.
     pub denoised: Score,
-    /// Other programs' outputs, by the name they were given.
+    /// Scores of other programs' images, by name.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub baselines: BTreeMap<String, Score>,
-    /// RelMSE of the reference against a perfect one, where the data set knows it.
+    /// Expected RelMSE of the reference against a noise-free image, if the data set has it.
     pub reference_residual: Option<f64>,
 }
 
 impl ImageScore {
-    /// The headline scores of `frame` and its denoised image (planar `[3, H, W]`, linear HDR).
+    /// RelMSE and SSIM of `frame` and its denoised image.
+    ///
+    /// # Shapes
+    /// `denoised` is planar `[3, H, W]` in linear HDR.
     ///
     /// # Errors
-    /// [`DenoiseError::NoReference`] for a frame without reference, [`DenoiseError::Image`] for values that are not
-    /// finite.
+    /// [`DenoiseError::NoReference`] for a frame without reference, [`DenoiseError::Image`] for NaN
+    /// or infinite values.
     pub fn new(
         frame: &Frame,
         denoised: &[f32],
@@ -126,7 +133,10 @@ impl ImageScore {
         Self::measure(frame, denoised, &[], reference_residual, Score::headline)
     }
 
-    /// The scores of `frame`, its denoised image and other programs' images of it, in all metrics.
+    /// All metrics of `frame`, its denoised image and its baselines.
+    ///
+    /// # Shapes
+    /// `denoised` and each baseline are planar `[3, H, W]` in linear HDR.
     ///
     /// # Errors
     /// As [`new`](Self::new).
@@ -162,7 +172,7 @@ impl ImageScore {
         })
     }
 
-    /// All that was scored, by name: `noisy`, `black`, the baselines, `denoised`.
+    /// All scores by name: `noisy`, `black`, the baselines, `denoised`.
     pub fn methods(&self) -> Vec<(&str, &Score)> {
         methods(&self.noisy, &self.black, &self.baselines, &self.denoised)
     }
@@ -182,7 +192,7 @@ fn methods<'a>(
         .collect()
 }
 
-/// An image of `frame` that can be measured.
+/// An image of `frame`, prepared for the metrics.
 pub(crate) fn image_of<'a>(
     frame: &Frame,
     what: &str,
@@ -204,10 +214,10 @@ pub(crate) fn reference_of(frame: &Frame) -> Result<Image<'_>, DenoiseError> {
     image_of(frame, "reference", planes)
 }
 
-/// Denoises `frame` and takes its headline scores: one image in memory at a time.
+/// Denoises `frame` and computes RelMSE and SSIM.
 ///
 /// # Errors
-/// As [`Bundle::denoise`], and for a frame without reference.
+/// As [`Bundle::denoise`] and [`ImageScore::new`].
 pub fn score(
     bundle: &Bundle,
     frame: &Frame,
@@ -216,42 +226,44 @@ pub fn score(
     ImageScore::new(frame, &bundle.denoise(frame)?, reference_residual)
 }
 
-/// The means over a report's images.
+/// Mean scores over a report's images.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MeanScore {
-    /// Of the inputs.
+    /// Mean score of the inputs.
     pub noisy: Score,
-    /// Of images of zeros.
+    /// Mean score of all-zero images.
     pub black: Score,
-    /// Of the network's outputs.
+    /// Mean score of the network's outputs.
     pub denoised: Score,
-    /// Of other programs' outputs.
+    /// Mean scores of other programs' images, by name.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub baselines: BTreeMap<String, Score>,
 }
 
 impl MeanScore {
-    /// As [`ImageScore::methods`].
+    /// All mean scores by name, as [`ImageScore::methods`].
     pub fn methods(&self) -> Vec<(&str, &Score)> {
         methods(&self.noisy, &self.black, &self.baselines, &self.denoised)
     }
 }
 
-/// The scores of several images and their mean. [`Display`](std::fmt::Display) is a Markdown table of the headlines; the
-/// JSON of `serde` is `{"images": [...], "mean": {...}}`.
+/// The scores of several images and their mean.
+///
+/// [`Display`](std::fmt::Display) gives a Markdown table of RelMSE and SSIM. The JSON is
+/// `{"images": [...], "mean": {...}}`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Report {
-    /// One score an image, in the order given.
+    /// One entry per image, in the given order.
     pub images: Vec<ImageScore>,
-    /// Their mean; every image counts the same.
+    /// Their mean with equal weights.
     pub mean: MeanScore,
 }
 
 impl Report {
     /// The report on these images, which have the same baselines.
     pub fn new(images: Vec<ImageScore>) -> Self {
-        let mean = |of: &dyn Fn(&ImageScore) -> Option<&Score>| {
-            Score::mean(&images.iter().filter_map(of).collect::<Vec<_>>())
+        let mean = |score: &dyn Fn(&ImageScore) -> Option<&Score>| {
+            Score::mean(&images.iter().filter_map(score).collect::<Vec<_>>())
         };
         let baselines = images.first().map(|image| image.baselines.keys());
         let baselines = baselines.into_iter().flatten().map(|name| {
@@ -308,7 +320,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn json_has_every_metric_beside_the_headlines_and_reads_back() {
+    fn json_has_every_metric_and_survives_a_round_trip() {
         let mut frame = crate::bundle::testing::frame(50, 44);
         frame.reference = Some(frame.color.iter().map(|x| x + 0.1).collect());
         let other = vec![0.25; frame.color.len()];

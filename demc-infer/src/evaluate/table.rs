@@ -1,4 +1,4 @@
-//! A report as a Markdown table: a row an image, and for each metric a column for each thing that was scored.
+//! A report as a Markdown table: one row per image, one column per metric and method.
 
 use std::fmt;
 
@@ -6,11 +6,11 @@ use demc_model::metrics::{METRICS, Metric};
 
 use super::{Report, Score, is_headline};
 
-/// What a score without a value looks like.
+/// Cell of a metric without a value.
 const NONE: &str = "-";
 
 impl Report {
-    /// The headlines, and `more` metrics, as a Markdown table that ends with what the columns mean.
+    /// A Markdown table of RelMSE, SSIM and `more` metrics, followed by their definitions.
     pub fn table(&self, more: &[&Metric]) -> String {
         let headlines = METRICS.iter().filter(|metric| is_headline(metric.name));
         let more = more.iter().copied().filter(|m| !is_headline(m.name));
@@ -32,7 +32,7 @@ impl fmt::Display for Report {
     }
 }
 
-/// What a metric is called at the head of a column.
+/// Name of a metric in a column's head.
 fn label(metric: &Metric) -> &'static str {
     match metric.name {
         "relmse" => "RelMSE",
@@ -41,7 +41,7 @@ fn label(metric: &Metric) -> &'static str {
     }
 }
 
-/// The metric stands before the first column of its group only, so that the table stays narrow.
+/// Only the first column of a metric has its name, so that the table stays narrow.
 fn head(metrics: &[&Metric], methods: &[(&str, &Score)]) -> Vec<String> {
     let mut cells = vec!["image".to_owned()];
     for metric in metrics {
@@ -76,12 +76,12 @@ fn row(
     cells
 }
 
-/// A name that cannot end its cell.
 fn escaped(name: &str) -> String {
     name.replace('|', "\\|")
 }
 
-/// Rows of one width, a rule under the first; the first column to the left, the others to the right.
+/// Aligned rows with a rule under the first. The first column is left-aligned, the others
+/// right-aligned.
 fn aligned(rows: &[Vec<String>]) -> String {
     let width = |column: usize| rows.iter().map(|r| r[column].chars().count()).max();
     let widths: Vec<usize> = (0..rows[0].len()).filter_map(width).collect();

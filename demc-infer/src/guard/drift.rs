@@ -1,40 +1,50 @@
-//! An image's numbers beside those of the training scenes.
+//! Compares an image's statistics with the ranges of the training scenes.
 
 use demc_data::frame::FEATURE_NAMES;
 use demc_data::ranges::Range;
-use demc_data::{Ranges, Summary};
+use demc_data::{FrameSummary, Ranges};
 
 use super::Warning;
 
-/// How far outside the training scenes' range a mean may lie, in widths of that range (ours: another scene has its camera somewhere
-/// else; of the data set's 19 test scenes against its 89 training scenes the farthest is at 0.18).
-const FAR: f64 = 1.0;
+/// Largest distance of a mean from the training scenes' range, in widths of that range.
+///
+/// Ours. Of the data set's 19 test scenes against its 89 training scenes, the farthest is at 0.18.
+const MAX_DISTANCE: f64 = 1.0;
 
-/// How many times the largest of the training scenes' deviations a deviation may be (the test scenes' most is 1.5).
-const WIDE: f64 = 3.0;
+/// Largest ratio of a deviation to the training scenes' largest (ours; the test scenes' maximum is
+/// 1.5).
+const MAX_DEVIATION_RATIO: f64 = 3.0;
 
-/// How many stops outside the training scenes' range the exposure may lie (the test scenes' most is 0.75).
-const STOPS: f64 = 1.0;
+/// Largest distance of the exposure from the training scenes' range, in stops (ours; the test
+/// scenes' maximum is 0.75).
+const MAX_STOPS: f64 = 1.0;
 
-/// A channel's range is taken to be at least this wide, in the channel's unit: one that the training scenes hardly use.
-const LEAST_WIDTH: f64 = 0.05;
+/// Smallest assumed width of a channel's range, in the channel's unit: for channels that the
+/// training scenes hardly use (ours).
+const MIN_WIDTH: f64 = 0.05;
 
-/// Channels of a buffer.
+/// Number of channels of a buffer.
 const BUFFER: usize = 3;
 
-/// The name of a buffer, and what it likely is when it drifts.
+/// The name of each buffer, and the likely cause when it drifts.
 const BUFFERS: [(&str, &str); 4] = [
-    ("normal", "another buffer, or another space?"),
+    ("normal", "is it another buffer, or in another space?"),
     (
         "position",
-        "another unit, or a scene far from the origin? Training on scenes of that scale would help",
+        "is it in another unit, or is the scene far from the origin? Training on scenes of that scale would help",
     ),
-    ("texture1", "another buffer, or not a reflectance?"),
-    ("texture2", "another buffer, or not a reflectance?"),
+    (
+        "texture1",
+        "is it another buffer, or something other than albedo?",
+    ),
+    (
+        "texture2",
+        "is it another buffer, or something other than albedo?",
+    ),
 ];
 
 /// One warning for the exposure and one for each buffer that drifts.
-pub(super) fn warnings(image: &Summary, training: &Ranges) -> Vec<Warning> {
+pub(super) fn warnings(image: &FrameSummary, training: &Ranges) -> Vec<Warning> {
     let features = BUFFERS
         .iter()
         .enumerate()
@@ -55,22 +65,24 @@ pub(super) fn warnings(image: &Summary, training: &Ranges) -> Vec<Warning> {
         .collect()
 }
 
-/// What is wrong with a channel's mean or deviation.
-fn channel_drift(image: &Summary, training: &Ranges, channel: usize) -> Option<String> {
+/// How a channel's mean or deviation leaves the training range; `None` if it does not.
+fn channel_drift(image: &FrameSummary, training: &Ranges, channel: usize) -> Option<String> {
     let (mean, std) = (image.mean[channel], image.std[channel]);
     let (means, stds) = (training.mean[channel], training.std[channel]);
     let (low, high) = (f64::from(means.low), f64::from(means.high));
-    let width = (high - low).max(LEAST_WIDTH);
-    let beyond = (low - mean).max(mean - high) / width;
-    if beyond > FAR {
+    let width = (high - low).max(MIN_WIDTH);
+    let distance = (low - mean).max(mean - high) / width;
+    if distance > MAX_DISTANCE {
         return Some(format!(
-            "its mean is {mean:.3}, {low:.3} to {high:.3} in the training scenes"
+            "its mean is {mean:.3}, in the training scenes {low:.3} to {high:.3}"
         ));
     }
-    let most = f64::from(stds.high).max(LEAST_WIDTH);
-    (std > WIDE * most).then(|| {
-        let least = stds.low;
-        format!("it varies by {std:.3}, {least:.3} to {most:.3} in the training scenes")
+    let largest = f64::from(stds.high).max(MIN_WIDTH);
+    (std > MAX_DEVIATION_RATIO * largest).then(|| {
+        let smallest = stds.low;
+        format!(
+            "its standard deviation is {std:.3}, in the training scenes {smallest:.3} to {largest:.3}"
+        )
     })
 }
 
@@ -81,11 +93,14 @@ fn exposure(found: f64, training: Range) -> Option<Warning> {
         true => (below, "darker than the darkest"),
         false => (above, "brighter than the brightest"),
     };
-    // A black image has nothing to expose.
-    (found > 0.0 && stops > STOPS).then(|| Warning {
+    // A black image has no exposure.
+    (found > 0.0 && stops > MAX_STOPS).then(|| Warning {
         what: "colour".into(),
-        found: format!("it is {stops:.1} stops {than} training scenes (exposure {found:.4}, there {low:.4} to {high:.4})"),
-        cause: "wrong exposure or unit? Scale the radiance before, and back after",
+        found: format!(
+            "it is {stops:.1} stops {than} training scene \
+             (exposure {found:.4}, in the training scenes {low:.4} to {high:.4})"
+        ),
+        cause: "is the exposure or the unit wrong? Scale the radiance before denoising, and back afterwards",
     })
 }
 
@@ -93,10 +108,10 @@ fn exposure(found: f64, training: Range) -> Option<Warning> {
 mod tests {
     use super::*;
 
-    fn summary(exposure: f64, position_x: f64, deviation: f64) -> Summary {
+    fn summary(exposure: f64, position_x: f64, deviation: f64) -> FrameSummary {
         let mut mean = [0.5; 12];
         mean[3] = position_x;
-        Summary {
+        FrameSummary {
             exposure,
             mean,
             std: [deviation; 12],
@@ -104,14 +119,14 @@ mod tests {
     }
 
     fn training() -> Ranges {
-        let scenes: Vec<Summary> = (0..20)
+        let scenes: Vec<FrameSummary> = (0..20)
             .map(|i| summary(0.1 + 0.01 * f64::from(i), f64::from(i), 0.2))
             .collect();
         Ranges::of(&scenes)
     }
 
     #[test]
-    fn an_image_like_the_training_scenes_is_quiet() {
+    fn an_image_like_the_training_scenes_causes_no_warning() {
         assert_eq!(warnings(&summary(0.2, 3.0, 0.2), &training()), []);
         assert_eq!(warnings(&summary(0.2, -5.0, 0.3), &training()), []);
         assert_eq!(warnings(&summary(0.0, 3.0, 0.2), &training()), []);
@@ -132,8 +147,9 @@ mod tests {
             panic!("one warning");
         };
         assert!(
-            far.to_string()
-                .starts_with("position.x: its mean is 1000.000, 1.000 to 18.000 in the training"),
+            far.to_string().starts_with(
+                "position.x: its mean is 1000.000, in the training scenes 1.000 to 18"
+            ),
             "{far}"
         );
         let wide = warnings(&summary(0.2, 3.0, 2.0), &training());

@@ -1,27 +1,33 @@
-//! Whether an output is as bright as its input. A path tracer's noisy image is right in the mean, so no reference is needed.
+//! Compares the mean of an output with that of its input. A path tracer's noisy image is unbiased,
+//! so no reference is needed.
 
 use demc_data::Frame;
 use demc_model::config::COLOR_CHANNELS;
 
 use super::Warning;
 
-/// A bias below this is not worth a word (ours).
-const SMALL: f64 = 0.1;
+/// Smallest bias that causes a warning (ours).
+const MIN_BIAS: f64 = 0.1;
 
-/// A bias within so many standard errors may be the noise of the input.
-const SURE: f64 = 4.0;
+/// Smallest number of standard errors that causes a warning; less may be noise in the input (ours).
+const MIN_STANDARD_ERRORS: f64 = 4.0;
 
-/// The mean of an output beside that of its input.
+/// The relative difference between the means of an output and its input.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct EnergyBias {
-    /// Mean of the output over mean of the input, minus 1, over all channels of linear HDR; 0 where the input is black.
+    /// Mean of the output divided by mean of the input, minus 1, over all channels of linear HDR; 0
+    /// for a black input.
     pub bias: f64,
-    /// Standard error of [`bias`](Self::bias) from the input's noise: its difference from the output, pixel by pixel.
+    /// Standard error of [`bias`](Self::bias) due to the input's noise, estimated from the
+    /// differences between output and input per pixel.
     pub standard_error: f64,
 }
 
 impl EnergyBias {
-    /// Of `frame` and its denoised image, planar `[3, H, W]` in linear HDR.
+    /// Measures `frame` and its denoised image.
+    ///
+    /// # Shapes
+    /// `denoised_hdr` is planar `[3, H, W]` in linear HDR.
     pub fn of(frame: &Frame, denoised_hdr: &[f32]) -> Self {
         let pixels = frame.color.len() / COLOR_CHANNELS;
         let sum = |image: &[f32], i: usize| -> f64 {
@@ -48,13 +54,14 @@ impl EnergyBias {
         }
     }
 
-    /// A warning where the bias is neither small nor the input's noise.
+    /// A warning if the bias is large and significant.
     pub fn warning(self) -> Option<Warning> {
         let Self {
             bias,
             standard_error,
         } = self;
-        (bias.abs() > SMALL && bias.abs() > SURE * standard_error).then(|| Warning {
+        let significant = bias.abs() > MIN_STANDARD_ERRORS * standard_error;
+        (bias.abs() > MIN_BIAS && significant).then(|| Warning {
             what: "output".into(),
             found: format!(
                 "its mean is {:.0} % {} the input's (+- {:.1} %)",
@@ -62,7 +69,7 @@ impl EnergyBias {
                 if bias < 0.0 { "below" } else { "above" },
                 100.0 * standard_error
             ),
-            cause: "the network loses or adds light here: compare before it replaces a longer render",
+            cause: "the network removes or adds light; compare it with a converged render before you use it",
         })
     }
 }
@@ -83,9 +90,9 @@ mod tests {
         }
     }
 
-    /// One bright pixel carries most of the mean: an output without it may be right.
+    /// One bright pixel dominates the mean, so an output without it may be correct.
     #[test]
-    fn a_firefly_is_no_bias() {
+    fn a_firefly_causes_no_warning() {
         let mut frame = frame(40, 30);
         let denoised = frame.color.clone();
         frame.color[7] = 3000.0;

@@ -1,40 +1,44 @@
-//! Marks of swapped, packed and turned buffers, from what normals, positions and textures are: unit vectors in the space of
-//! the positions, points of surfaces that those normals stand on, reflectances.
+//! Detects swapped, packed and rotated buffers from the properties of the buffers.
 //!
-//! Medians over a regular share of the pixels whose camera rays all hit something. The limits leave room for every one of the
-//! data set's 108 scenes; the farthest of them is named beside each.
+//! - Normals are unit vectors and perpendicular to the surface that the positions describe.
+//! - Normals and positions are in the same space, world space.
+//! - Albedo is not negative.
+//!
+//! Each test takes a median or a share over a regular grid of pixels that hit a surface. All 108
+//! scenes of the data set pass; the scene closest to each limit is named beside it.
 
 use demc_data::Frame;
 
 use super::Warning;
 
-/// Most pixels that are looked at.
-const SAMPLES: usize = 1 << 16;
-/// Fewest pixels that tell anything.
-const FEWEST: usize = 64;
-/// How long a normal is, in the median (all scenes: 1.00).
+/// Largest number of tested pixels.
+const MAX_SAMPLES: usize = 1 << 16;
+/// Smallest number of pixels for a meaningful test.
+const MIN_SAMPLES: usize = 64;
+/// Median length of the normals (all scenes: 1.00).
 const UNIT: std::ops::RangeInclusive<f32> = 0.9..=1.1;
-/// Share of the pixels where a packed normal, unpacked, is a unit vector (of all scenes' normals at least 0.755 are, in the classroom;
-/// of their textures, taken for packed normals, at most 0.589).
+/// Share of pixels with a unit vector after unpacking that identifies packed normals. Of the
+/// scenes' own normals, packed, at least 0.755 are (classroom); of their albedo at most 0.589.
 const PACKED: f32 = 0.67;
-/// How far below 0 a packed normal or a texture may lie.
-const BELOW: f32 = -0.05;
-/// Least cosine between the normals and those of the surface that the positions make, in the median (classroom: 0.977).
+/// Smallest value of a packed normal or an albedo.
+const LOWEST: f32 = -0.05;
+/// Smallest median cosine between the normals and the surface that the positions describe
+/// (classroom: 0.977).
 const ALIGNED: f32 = 0.8;
-/// Share of the normals that are turned towards the origin from which on the origin must be the camera (staircase: 0.995).
+/// Share of normals that face the origin above which the origin must be the camera (staircase:
+/// 0.995).
 const FACING: f32 = 0.9995;
 
-/// Planes of the features.
+/// First plane of each buffer.
 const NORMAL: usize = 0;
 const POSITION: usize = 3;
 const TEXTURE1: usize = 6;
 
 type Vector = [f32; 3];
 
-/// Everything that is found.
 pub(super) fn warnings(frame: &Frame) -> Vec<Warning> {
-    let hits = Hits::of(frame);
-    if hits.pixels.len() < FEWEST {
+    let hits = SurfacePixels::of(frame);
+    if hits.pixels.len() < MIN_SAMPLES {
         return Vec::new();
     }
     [hits.normals(), hits.texture()]
@@ -43,25 +47,24 @@ pub(super) fn warnings(frame: &Frame) -> Vec<Warning> {
         .collect()
 }
 
-/// A frame, and pixels within it that hit a surface, as all their neighbours do.
-struct Hits<'a> {
+/// A frame, and the tested pixels: they and their four neighbours hit a surface.
+struct SurfacePixels<'a> {
     frame: &'a Frame,
     pixels: Vec<usize>,
 }
 
-impl<'a> Hits<'a> {
+impl<'a> SurfacePixels<'a> {
     fn of(frame: &'a Frame) -> Self {
         let Frame { width, height, .. } = *frame;
-        let vector = |i| at(frame, POSITION, i);
         let hit = |i: usize| match &frame.mask {
             Some(mask) => mask[i] >= 1.0,
-            None => vector(i) != [0.0; 3],
+            None => vector(frame, POSITION, i) != [0.0; 3],
         };
         let inner = |length: usize| 1..length.saturating_sub(1);
         let count = inner(width).len() * inner(height).len();
         let pixels = inner(height)
             .flat_map(|y| inner(width).map(move |x| y * width + x))
-            .step_by(count.div_ceil(SAMPLES).max(1))
+            .step_by(count.div_ceil(MAX_SAMPLES).max(1))
             .filter(|i| {
                 [*i, i - 1, i + 1, i - width, i + width]
                     .into_iter()
@@ -71,10 +74,10 @@ impl<'a> Hits<'a> {
         Self { frame, pixels }
     }
 
-    /// What is wrong with the normals; the first of the marks that fits.
+    /// The first mistake in the normals.
     fn normals(&self) -> Option<Warning> {
-        let length = self.median(|i| norm(at(self.frame, NORMAL, i)));
-        let packed = |i| at(self.frame, NORMAL, i).map(|x| 2.0 * x - 1.0);
+        let length = self.median(|i| norm(vector(self.frame, NORMAL, i)));
+        let packed = |i| vector(self.frame, NORMAL, i).map(|x| 2.0 * x - 1.0);
         let warning = |found, cause| {
             Some(Warning {
                 what: "normal".into(),
@@ -83,61 +86,65 @@ impl<'a> Hits<'a> {
             })
         };
         let unpacked = self.share(|i| UNIT.contains(&norm(packed(i))));
-        if unpacked >= PACKED && self.least(NORMAL) >= BELOW {
+        if unpacked >= PACKED && self.minimum(NORMAL) >= LOWEST {
             let percent = 100.0 * unpacked;
             return warning(
                 format!(
                     "no value is negative, and 2 n - 1 is a unit vector at {percent:.0} % of the pixels"
                 ),
-                "packed into 0 to 1? Unpack it: n = 2 x - 1",
+                "is it packed into 0 to 1? Unpack it: n = 2 x - 1",
             );
         }
         if !UNIT.contains(&length) {
             return warning(
                 format!("its length is {length:.2} in the median, not 1"),
-                "another buffer (swapped with a texture?) or not normalised",
+                "is it another buffer (swapped with albedo?), or not normalised?",
             );
         }
         let cosine = self.median(|i| self.cosine(i));
         if cosine < ALIGNED {
             return warning(
                 format!(
-                    "it stands on the surface that the positions make at a cosine of {cosine:.2}"
+                    "its median cosine with the surface that the positions describe is {cosine:.2}, not 1"
                 ),
-                "normals in camera space beside positions in world space, or axes swapped?",
+                "are normals in camera space and positions in world space, or axes swapped?",
             );
         }
-        let facing =
-            self.share(|i| dot(at(self.frame, NORMAL, i), at(self.frame, POSITION, i)) < 0.0);
+        let facing = self.share(|i| {
+            dot(
+                vector(self.frame, NORMAL, i),
+                vector(self.frame, POSITION, i),
+            ) < 0.0
+        });
         if facing > FACING {
             return warning(
-                "all normals are turned towards the origin".into(),
-                "normals and positions in camera space? The network was trained on world space",
+                "all normals face the origin".into(),
+                "are normals and positions in camera space? The network was trained on world space",
             );
         }
         None
     }
 
     fn texture(&self) -> Option<Warning> {
-        let least = self.least(TEXTURE1);
-        (least < BELOW).then(|| Warning {
+        let minimum = self.minimum(TEXTURE1);
+        (minimum < LOWEST).then(|| Warning {
             what: "texture1".into(),
-            found: format!("it goes down to {least:.2}"),
-            cause: "a reflectance is not negative: swapped with the normal?",
+            found: format!("its minimum is {minimum:.2}"),
+            cause: "albedo is not negative: is it swapped with the normal?",
         })
     }
 
-    /// Cosine between the normal and that of the surface through the neighbours' positions, without regard to its side.
+    /// Absolute cosine between the normal and the surface through the neighbours' positions.
     fn cosine(&self, i: usize) -> f32 {
-        let position = |i| at(self.frame, POSITION, i);
+        let position = |i| vector(self.frame, POSITION, i);
         let across = difference(position(i + 1), position(i - 1));
         let down = difference(
             position(i + self.frame.width),
             position(i - self.frame.width),
         );
         let surface = cross(across, down);
-        let normal = at(self.frame, NORMAL, i);
-        // Where the positions do not move (a flat buffer), nothing is known.
+        let normal = vector(self.frame, NORMAL, i);
+        // A constant position buffer describes no surface.
         match norm(surface) * norm(normal) {
             0.0 => 1.0,
             lengths => (dot(surface, normal) / lengths).abs(),
@@ -155,15 +162,15 @@ impl<'a> Hits<'a> {
         count as f32 / self.pixels.len() as f32
     }
 
-    /// The least value of a buffer.
-    fn least(&self, first: usize) -> f32 {
-        let vectors = self.pixels.iter().map(|i| at(self.frame, first, *i));
+    /// Smallest value of the buffer that starts at plane `first`.
+    fn minimum(&self, first: usize) -> f32 {
+        let vectors = self.pixels.iter().map(|i| vector(self.frame, first, *i));
         vectors.flatten().fold(f32::INFINITY, f32::min)
     }
 }
 
-/// Three planes from `first` on, at pixel `i`.
-fn at(frame: &Frame, first: usize, i: usize) -> Vector {
+/// The vector at pixel `i` of the buffer that starts at plane `first`.
+fn vector(frame: &Frame, first: usize, i: usize) -> Vector {
     let pixels = frame.width * frame.height;
     std::array::from_fn(|channel| frame.features[(first + channel) * pixels + i])
 }
@@ -194,15 +201,15 @@ mod tests {
 
     const SIDE: usize = 40;
 
-    /// A floor and a wall seen from `camera`, in world space, with a grey texture.
+    /// A floor and a wall seen from `camera`, in world space, with grey albedo.
     fn room(camera: Vector) -> Frame {
         let pixels = SIDE * SIDE;
         let mut features = vec![0.5; FEATURES * pixels];
         for y in 0..SIDE {
             for x in 0..SIDE {
-                let at = [x, y].map(|v| v as f32 / SIDE as f32 - 0.49);
-                // Through the pixel, down to the floor y = 0 or to the wall z = 0, whatever is nearer.
-                let ray = [at[0], -at[1], -1.0];
+                let [u, v] = [x, y].map(|value| value as f32 / SIDE as f32 - 0.49);
+                // The ray hits the floor y = 0 or the wall z = 0, whichever is nearer.
+                let ray = [u, -v, -1.0];
                 let wall = camera[2];
                 let floor = if ray[1] < 0.0 {
                     -camera[1] / ray[1]
@@ -233,12 +240,11 @@ mod tests {
         }
     }
 
-    /// Each vector of a buffer by `map`.
     fn mapped(mut frame: Frame, first: usize, map: impl Fn(Vector) -> Vector) -> Frame {
         let pixels = SIDE * SIDE;
         for i in 0..pixels {
-            let vector = map(at(&frame, first, i));
-            for (channel, value) in vector.into_iter().enumerate() {
+            let mapped = map(vector(&frame, first, i));
+            for (channel, value) in mapped.into_iter().enumerate() {
                 frame.features[(first + channel) * pixels + i] = value;
             }
         }
@@ -253,7 +259,7 @@ mod tests {
     const CAMERA: Vector = [1.0, 1.5, 4.0];
 
     #[test]
-    fn a_room_in_world_space_is_quiet() {
+    fn a_room_in_world_space_causes_no_warning() {
         assert_eq!(found(&room(CAMERA)), [""; 0]);
     }
 
@@ -268,15 +274,15 @@ mod tests {
         let long = mapped(room(CAMERA), NORMAL, |n| n.map(|x| 2.0 * x));
         assert!(one(&long).starts_with("normal: its length is 2.00"));
         let turned = mapped(room(CAMERA), NORMAL, |[x, y, z]| [x, z, -y]);
-        assert!(one(&turned).contains("camera space beside positions in world space"));
+        assert!(one(&turned).contains("normals in camera space and positions in world space"));
         let camera = mapped(room(CAMERA), POSITION, |p| difference(p, CAMERA));
         assert!(one(&camera).contains("normals and positions in camera space"));
         let shifted = mapped(room(CAMERA), TEXTURE1, |t| t.map(|x| x - 1.0));
-        assert!(one(&shifted).starts_with("texture1: it goes down to -0.50"));
+        assert!(one(&shifted).starts_with("texture1: its minimum is -0.50"));
     }
 
     #[test]
-    fn swapped_buffers_are_named_both() {
+    fn both_swapped_buffers_are_named() {
         let mut frame = mapped(room(CAMERA), NORMAL, |[x, y, z]| [x, -y, z]);
         let pixels = SIDE * SIDE;
         for i in 0..3 * pixels {
@@ -290,13 +296,13 @@ mod tests {
             "{found:?}"
         );
         assert!(
-            found[1].starts_with("texture1: it goes down to -1.00"),
+            found[1].starts_with("texture1: its minimum is -1.00"),
             "{found:?}"
         );
     }
 
     #[test]
-    fn an_image_that_hits_nothing_or_is_tiny_says_nothing() {
+    fn an_empty_or_tiny_image_causes_no_warning() {
         let mut frame = mapped(room(CAMERA), NORMAL, |n| n.map(|x| 2.0 * x));
         frame.mask = Some(vec![0.0; SIDE * SIDE]);
         assert_eq!(found(&frame), [""; 0]);

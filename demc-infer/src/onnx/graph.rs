@@ -1,9 +1,13 @@
-//! A graph under construction: nodes, constants, and the names that tie them together.
+//! Builds a graph: nodes and constants, connected by the names of their values.
 
+use burn::module::ParamId;
+use demc_model::WeightSpec;
 use half::f16;
 use half::slice::HalfFloatSliceExt;
 
-use super::proto::{self, Attribute, FLOAT, FLOAT16, INT, INT64, INTS, Node, Tensor};
+use super::proto::{
+    AttributeProto, FLOAT, FLOAT16, GraphProto, INT, INT64, INTS, NodeProto, TensorProto,
+};
 use crate::Precision;
 use crate::bundle::tensors::f32_bytes;
 
@@ -11,38 +15,43 @@ use crate::bundle::tensors::f32_bytes;
 #[derive(Clone, Debug)]
 pub(super) struct Value(pub(super) String);
 
-/// The settings of an operator.
-pub(super) type Attributes<'a> = &'a [(&'a str, Setting<'a>)];
+/// The attributes of an operator by name.
+pub(super) type Attributes<'a> = &'a [(&'a str, AttributeValue<'a>)];
 
-/// One of them.
-pub(super) enum Setting<'a> {
+/// The value of an attribute.
+pub(super) enum AttributeValue<'a> {
     Int(i64),
     Ints(&'a [usize]),
 }
 
-/// Nodes and constants so far.
-pub(super) struct Graph {
+/// A graph under construction.
+pub(super) struct GraphBuilder {
     precision: Precision,
-    nodes: Vec<Node>,
-    constants: Vec<Tensor>,
+    /// The network's tensors in the order of their ids, which start at 1.
+    specs: Vec<WeightSpec>,
+    nodes: Vec<NodeProto>,
+    constants: Vec<TensorProto>,
 }
 
-impl Graph {
-    /// An empty one whose kernels will be stored with this precision.
-    pub(super) fn new(precision: Precision) -> Self {
-        Graph {
+impl GraphBuilder {
+    pub(super) fn new(precision: Precision, specs: Vec<WeightSpec>) -> Self {
+        GraphBuilder {
             precision,
+            specs,
             nodes: Vec::new(),
             constants: Vec::new(),
         }
     }
 
-    /// How kernels are stored.
     pub(super) fn precision(&self) -> Precision {
         self.precision
     }
 
-    /// Adds a node called `name`, which is also what its value is called.
+    pub(super) fn spec(&self, id: ParamId) -> WeightSpec {
+        self.specs[id.val() as usize - 1].clone()
+    }
+
+    /// Adds a node. Its name is also the name of its value.
     pub(super) fn node(
         &mut self,
         op: &str,
@@ -50,20 +59,22 @@ impl Graph {
         inputs: &[&Value],
         attributes: Attributes,
     ) -> Value {
-        let attribute = attributes.iter().map(|(name, setting)| {
-            let (i, ints, r#type) = match setting {
-                Setting::Int(i) => (Some(*i), Vec::new(), INT),
-                Setting::Ints(ints) => (None, ints.iter().map(|&i| i as i64).collect(), INTS),
+        let attribute = attributes.iter().map(|(name, value)| {
+            let (i, ints, r#type) = match value {
+                AttributeValue::Int(i) => (Some(*i), Vec::new(), INT),
+                AttributeValue::Ints(ints) => {
+                    (None, ints.iter().map(|&i| i as i64).collect(), INTS)
+                }
             };
             let name = name.to_string();
-            Attribute {
+            AttributeProto {
                 name,
                 i,
                 ints,
                 r#type,
             }
         });
-        self.nodes.push(Node {
+        self.nodes.push(NodeProto {
             input: inputs.iter().map(|value| value.0.clone()).collect(),
             output: vec![name.into()],
             name: name.into(),
@@ -73,18 +84,17 @@ impl Graph {
         Value(name.into())
     }
 
-    /// Adds an f32 constant.
     pub(super) fn constant(&mut self, name: &str, shape: &[usize], values: &[f32]) -> Value {
         self.store(name, shape, FLOAT, f32_bytes(values))
     }
 
-    /// Adds a list of integers.
     pub(super) fn integers(&mut self, name: &str, values: &[i64]) -> Value {
         let bytes = values.iter().flat_map(|value| value.to_le_bytes());
         self.store(name, &[values.len()], INT64, bytes.collect())
     }
 
-    /// Adds a kernel, stored as the precision says, and gives it as f32. Values must be exact in that precision.
+    /// Adds a kernel in the stored precision and returns it as f32. Values must be exact in that
+    /// precision.
     pub(super) fn kernel(&mut self, name: &str, shape: &[usize], values: &[f32]) -> Value {
         if self.precision == Precision::F32 {
             return self.constant(name, shape, values);
@@ -93,12 +103,12 @@ impl Graph {
         halves.convert_from_f32_slice(values);
         let bytes = halves.iter().flat_map(|half| half.to_le_bytes()).collect();
         let stored = self.store(name, shape, FLOAT16, bytes);
-        let to = [("to", Setting::Int(i64::from(FLOAT)))];
-        self.node("Cast", &format!("{name}.f32"), &[&stored], &to)
+        let target = [("to", AttributeValue::Int(i64::from(FLOAT)))];
+        self.node("Cast", &format!("{name}.f32"), &[&stored], &target)
     }
 
     fn store(&mut self, name: &str, shape: &[usize], data_type: i32, raw_data: Vec<u8>) -> Value {
-        self.constants.push(Tensor {
+        self.constants.push(TensorProto {
             dims: shape.iter().map(|&length| length as i64).collect(),
             data_type,
             name: name.into(),
@@ -107,12 +117,12 @@ impl Graph {
         Value(name.into())
     }
 
-    /// The graph's message, still without inputs, outputs and texts.
-    pub(super) fn finish(self) -> proto::Graph {
-        proto::Graph {
+    /// The graph's message, without inputs, outputs and texts.
+    pub(super) fn finish(self) -> GraphProto {
+        GraphProto {
             node: self.nodes,
             initializer: self.constants,
-            ..proto::Graph::default()
+            ..GraphProto::default()
         }
     }
 }

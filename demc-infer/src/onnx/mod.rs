@@ -1,18 +1,18 @@
-//! The network for other runtimes: one ONNX graph from what a renderer writes to what it wants.
+//! Exports the network for other runtimes as one ONNX graph, from a renderer's buffers to the
+//! denoised image.
 //!
-//! | name | shape | what |
-//! |---|---|---|
-//! | `color` | `[batch, 3, height, width]` | noisy radiance, linear HDR; below 0 counts as 0 |
-//! | `features` | `[batch, 12, height, width]` | raw features in the order of [`FEATURE_NAMES`], in the renderer's units |
-//! | `output` | `[batch, 3, height, width]` | radiance, linear HDR, not negative |
+//! - Input `color`, `[batch, 3, height, width]`: noisy radiance in linear HDR; below 0 counts as 0.
+//! - Input `features`, `[batch, 12, height, width]`: raw features, ordered as [`FEATURE_NAMES`].
+//! - Output `output`, `[batch, 3, height, width]`: radiance in linear HDR, not negative.
 //!
-//! Batch, height and width are free, height and width multiples of 32: of another size a runtime refuses the first skip
-//! fusion. Gamma, Z-score and the way back are in the graph, batch normalisation is folded into the convolutions before it.
-//! All variants have both inputs; color-only does not look at the second. In and out is float32, and so is every
-//! computation; [`Precision::F16`] is how the convolutions' weights are stored.
+//! The batch can have any size. Height and width must be multiples of 32; with another size, a
+//! runtime fails at the first skip fusion. The graph contains gamma, Z-score and their inverses.
+//! Batch normalisation is folded into the convolutions. All variants have both inputs; color-only
+//! ignores the second. Inputs, outputs and all computations are float32; [`Precision::F16`] only
+//! affects the stored weights of the convolutions.
 //!
-//! The opset is 17, of June 2022: later ones add types to the operators used here and change nothing that they compute, so a
-//! newer one would only shut older runtimes out.
+//! The operator set is 17 (June 2022). Later ones change no operator used here except for added
+//! types, so a newer set would only exclude older runtimes.
 
 mod graph;
 mod network;
@@ -27,19 +27,19 @@ use demc_model::ModelConfig;
 use demc_model::config::{COLOR_CHANNELS, FEATURE_CHANNELS};
 
 use crate::{Bundle, BundleError, Precision};
-use graph::Graph;
+use graph::GraphBuilder;
 use proto::{
-    Dimension, Entry, Extent, FLOAT, Message, Model, OperatorSet, Shape, TensorType, Type,
-    ValueInfo,
+    Dimension, Extent, FLOAT, Message, ModelProto, OperatorSetIdProto, StringStringEntryProto,
+    TensorShapeProto, TensorTypeProto, TypeProto, ValueInfoProto,
 };
 
 /// The operator set.
 pub const OPSET: i64 = 17;
-/// The version of the file format that came with it (ONNX 1.12).
+/// The version of the file format released with it (ONNX 1.12).
 const IR_VERSION: i64 = 8;
-/// Protobuf's limit for a message: what lies above it only files beside the graph could hold.
-const MOST_BYTES: u64 = i32::MAX as u64;
-/// More than a file takes beside its weights: names, settings, texts. Measured: 21 kB.
+/// Protobuf's limit for a message. Larger graphs would need separate files for the weights.
+const MAX_BYTES: u64 = i32::MAX as u64;
+/// Upper bound for the file's size without weights: names, attributes, texts. Measured: 21 kB.
 const OTHER_BYTES: u64 = 1 << 20;
 
 /// Name of the input with the noisy colour.
@@ -48,26 +48,30 @@ pub const COLOR: &str = "color";
 pub const FEATURES: &str = "features";
 /// Name of the output.
 pub const OUTPUT: &str = "output";
-/// Key of the metadata that a bundle has in its header: model, normalizer, layout, step, as JSON.
+/// Metadata key of the bundle's header as JSON: model, normalizer, layout, step.
 pub const META: &str = "demc";
-/// Key of the metadata with [`FEATURE_NAMES`], as JSON.
+/// Metadata key of [`FEATURE_NAMES`] as JSON.
 pub const FEATURE_ORDER: &str = "demc.features";
 
-const DOCUMENTATION: &str = "DEMC, a denoiser for Monte Carlo renderings (Yang et al. 2019). color [batch, 3, height, width] is noisy \
-    radiance in linear HDR, features [batch, 12, height, width] are shading normal xyz, world position xyz, texture RGB at the \
-    first and at the second intersection, raw, in the renderer's units; output [batch, 3, height, width] is radiance in linear \
-    HDR. Height and width are multiples of 32: repeat the last row and column, and cut the output. Values must be finite. \
-    Metadata: `demc` has model, statistics, channel names and training step as JSON, `demc.features` the order of the features.";
+const DOCUMENTATION: &str = "DEMC, a denoiser for Monte Carlo renderings (Yang et al. 2019). \
+    color [batch, 3, height, width] is noisy radiance in linear HDR. \
+    features [batch, 12, height, width] are shading normal xyz, world position xyz, and albedo RGB at the \
+    first and at the second intersection, raw, in the renderer's units. \
+    output [batch, 3, height, width] is radiance in linear HDR. \
+    Height and width must be multiples of 32: repeat the last row and column, and crop the output. \
+    Values must be finite. \
+    Metadata: `demc` holds model, statistics, channel names and training step as JSON, `demc.features` the \
+    order of the features.";
 
 impl Bundle {
-    /// Writes the network as an ONNX file, whole or not at all, then reads it back and compares. In f16 the file holds the
-    /// weights of [`rounded`](Self::rounded).
+    /// Writes the network as an ONNX file atomically, reads it back and compares. In f16 the file
+    /// holds the weights of [`rounded`](Self::rounded).
     ///
     /// The model must be on `flex`.
     ///
     /// # Errors
-    /// A weight that f16 cannot hold, a network too large for one file, a path that cannot be written;
-    /// [`BundleError::ReadBack`] where another file is read than was written.
+    /// A weight beyond f16's range, a network too large for one file, or a path that cannot be
+    /// written; [`BundleError::ReadBack`] if the file differs from what was written.
     pub fn export_onnx(&self, path: &Path, precision: Precision) -> Result<(), BundleError> {
         check_size(&self.meta.model, precision)?;
         let model = self.onnx(precision)?;
@@ -78,7 +82,7 @@ impl Bundle {
             path: path.into(),
             source,
         })?;
-        match Model::decode(&back[..]) {
+        match ModelProto::decode(&back[..]) {
             Ok(back) if back == model => Ok(()),
             Ok(_) => Err("the graph".to_string()),
             Err(error) => Err(error.to_string()),
@@ -90,9 +94,9 @@ impl Bundle {
     }
 
     /// The file's message.
-    fn onnx(&self, precision: Precision) -> Result<Model, BundleError> {
+    fn onnx(&self, precision: Precision) -> Result<ModelProto, BundleError> {
         let bundle = self.rounded(precision)?;
-        let mut graph = Graph::new(precision);
+        let mut graph = GraphBuilder::new(precision, bundle.meta.model.weight_specs());
         graph.denoise(&bundle.model, &bundle.meta.normalizer);
         let mut graph = graph.finish();
         graph.name = "demc".into();
@@ -104,18 +108,18 @@ impl Bundle {
         let json = |text: serde_json::Result<String>| {
             text.map_err(|error| BundleError::Encode(error.to_string()))
         };
-        let entry = |key: &str, value| Entry {
+        let entry = |key: &str, value| StringStringEntryProto {
             key: key.into(),
             value,
         };
-        Ok(Model {
+        Ok(ModelProto {
             ir_version: IR_VERSION,
             producer_name: "demc".into(),
             producer_version: env!("CARGO_PKG_VERSION").into(),
             model_version: i64::try_from(bundle.meta.step).ok(),
             doc_string: DOCUMENTATION.into(),
             graph: Some(graph),
-            opset_import: vec![OperatorSet {
+            opset_import: vec![OperatorSetIdProto {
                 domain: Some(String::new()),
                 version: OPSET,
             }],
@@ -127,20 +131,20 @@ impl Bundle {
     }
 }
 
-/// Refuses a network that one file cannot hold.
+/// Refuses a network that is too large for one file.
 fn check_size(config: &ModelConfig, precision: Precision) -> Result<(), BundleError> {
-    let each = match precision {
+    let bytes_per_value = match precision {
         Precision::F32 => 4,
         Precision::F16 => 2,
     };
-    match config.parameter_count() * each + OTHER_BYTES {
-        bytes if bytes > MOST_BYTES => Err(BundleError::TooLargeForOnnx { bytes }),
+    match config.parameter_count() * bytes_per_value + OTHER_BYTES {
+        bytes if bytes > MAX_BYTES => Err(BundleError::TooLargeForOnnx { bytes }),
         _ => Ok(()),
     }
 }
 
-/// A batch of images of any size.
-fn image(name: &str, channels: usize, doc_string: &str) -> ValueInfo {
+/// An input or output: a batch of images of any size.
+fn image(name: &str, channels: usize, doc_string: &str) -> ValueInfoProto {
     let named = |name: &str| Extent::Named(name.into());
     let extents = [
         named("batch"),
@@ -151,12 +155,12 @@ fn image(name: &str, channels: usize, doc_string: &str) -> ValueInfo {
     let dim = extents.map(|extent| Dimension {
         value: Some(extent),
     });
-    ValueInfo {
+    ValueInfoProto {
         name: name.into(),
-        r#type: Some(Type {
-            tensor_type: Some(TensorType {
+        r#type: Some(TypeProto {
+            tensor_type: Some(TensorTypeProto {
                 elem_type: FLOAT,
-                shape: Some(Shape { dim: dim.into() }),
+                shape: Some(TensorShapeProto { dim: dim.into() }),
             }),
         }),
         doc_string: doc_string.into(),

@@ -1,62 +1,64 @@
-//! The network as a graph: a walk over its modules, as `Denoiser::forward` makes it. What differs between variants and
-//! readings is in the modules and in the table of inputs; there is no branch on either here.
+//! Turns the network into a graph by visiting its modules in the order of `Denoiser::forward`.
+//!
+//! Variants and readings differ in the modules and in the table of inputs, so this file has no
+//! branch on either. Names, shapes and roles of the weights come from
+//! [`weight_specs`](demc_model::ModelConfig::weight_specs).
 
 use burn::nn::BatchNorm;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
 use demc_data::Normalizer;
 use demc_data::frame::TEXTURES;
-use demc_model::Denoiser;
 use demc_model::config::{COLOR_CHANNELS, FEATURE_CHANNELS, Input};
 use demc_model::decoder::DecoderLevel;
 use demc_model::encoder::EncoderLevel;
-use demc_model::inference::{Layer, scale_of};
+use demc_model::inference::{FoldedConv, norm_scale};
 use demc_model::layers::ConvBlock;
+use demc_model::{Denoiser, Role, WeightSpec};
 
-use super::graph::{Graph, Setting, Value};
+use super::graph::{AttributeValue, GraphBuilder, Value};
 use super::{COLOR, FEATURES, OUTPUT};
 use crate::Precision;
 
-impl Graph {
-    /// From the graph's inputs to its output, both linear HDR.
+impl GraphBuilder {
+    /// Adds everything from the inputs to the output, both in linear HDR.
     pub(super) fn denoise(&mut self, model: &Denoiser, normalizer: &Normalizer) {
         let modulation = self.modulation(normalizer);
         let color_gamma = self.color_gamma(normalizer.gamma, modulation.as_ref());
         let features_z = self.features_z(normalizer);
         let detail = model.fusion.as_ref().map(|fusion| {
-            let blocks = fusion.blocks.iter().enumerate();
-            blocks.fold(features_z.clone(), |x, (i, block)| {
-                self.block(&format!("fusion.blocks.{i}"), &x, block)
-            })
+            let blocks = fusion.blocks.iter();
+            blocks.fold(features_z.clone(), |x, block| self.block(&x, block))
         });
         let image = |input: &Input| match input {
             Input::Color => &color_gamma,
             Input::Features => &features_z,
-            Input::DetailMap => detail.as_ref().expect("a variant that eats it makes it"),
+            Input::DetailMap => detail
+                .as_ref()
+                .expect("variants with this input compute it"),
         };
-        // One list an encoder, from the full resolution down.
+        // One list per encoder, from the full resolution down.
         let mut skips: Vec<Vec<Value>> = Vec::new();
         let mut bottom = None;
         let inputs = model.config().variant.spec().encoders;
         for (e, (encoder, inputs)) in model.encoders.iter().zip(inputs).enumerate() {
-            let path = format!("encoders.{e}");
             let inputs: Vec<&Value> = inputs.iter().map(image).collect();
-            let mut x = Some(self.concat(&format!("{path}.input"), &inputs));
+            let mut x = Some(self.concat(&format!("encoders.{e}.input"), &inputs));
             skips.push(Vec::new());
-            for (i, level) in encoder.levels.iter().enumerate() {
-                let input = x.take().expect("only the last level has nothing below it");
-                let (skip, below) = self.descend(&format!("{path}.levels.{i}"), &input, level);
+            for level in &encoder.levels {
+                let input = x.take().expect("all levels but the last are pooled");
+                let (skip, below) = self.descend(&input, level);
                 skips[e].push(skip);
                 x = below;
             }
             bottom = x;
         }
         let bottom = bottom.expect("the last encoder feeds the latent");
-        let mut x = self.block("latent", &bottom, &model.latent);
-        for (k, level) in model.decoder.levels.iter().enumerate() {
+        let mut x = self.block(&bottom, &model.latent);
+        for level in &model.decoder.levels {
             let skips = skips.iter_mut().filter_map(Vec::pop).collect();
-            x = self.ascend(&format!("decoder.levels.{k}"), &x, skips, level);
+            x = self.ascend(&x, skips, level);
         }
-        let image = self.conv("decoder.head", &x, &model.decoder.head, None);
+        let image = self.conv(&x, &model.decoder.head, None);
         let mut image = self.node("Relu", "output_gamma", &[&image], &[]);
         if let Some(modulation) = &modulation {
             image = self.node("Mul", "output_modulated", &[&image, modulation], &[]);
@@ -65,11 +67,10 @@ impl Graph {
         self.node("Pow", OUTPUT, &[&image, &gamma], &[]);
     }
 
-    /// `(max(t, 0) + demodulate)^(1/gamma)`, t the first texture ([`Normalizer::modulation`]).
+    /// `(max(albedo, 0) + epsilon)^(1/gamma)` with the albedo of the first hit
+    /// ([`Normalizer::modulation`]).
     fn modulation(&mut self, normalizer: &Normalizer) -> Option<Value> {
-        if normalizer.demodulate == 0.0 {
-            return None;
-        }
+        let epsilon = normalizer.albedo_demodulation_epsilon?;
         let first = TEXTURES as i64;
         let bounds = [
             self.integers("texture_start", &[first]),
@@ -80,7 +81,7 @@ impl Graph {
         let raw = Value(FEATURES.into());
         let texture = self.node("Slice", "texture", &[&raw, start, end, axis], &[]);
         let positive = self.node("Relu", "texture_positive", &[&texture], &[]);
-        let offset = self.constant("demodulate", &[], &[normalizer.demodulate]);
+        let offset = self.constant("demodulate", &[], &[epsilon]);
         let divisor = self.node("Add", "modulation_hdr", &[&positive, &offset], &[]);
         let exponent = self.constant("inverse_gamma_texture", &[], &[1.0 / normalizer.gamma]);
         Some(self.node("Pow", "modulation", &[&divisor, &exponent], &[]))
@@ -92,7 +93,7 @@ impl Graph {
         let positive = self.node("Relu", "color_positive", &[&Value(COLOR.into())], &[]);
         let color = self.node("Pow", "color_gamma", &[&positive, &exponent], &[]);
         match modulation {
-            Some(by) => self.node("Div", "color_demodulated", &[&color, by], &[]),
+            Some(modulation) => self.node("Div", "color_demodulated", &[&color, modulation], &[]),
             None => color,
         }
     }
@@ -107,111 +108,113 @@ impl Graph {
         self.node("Div", "features_z", &[&centred, &std], &[])
     }
 
-    fn block(&mut self, path: &str, x: &Value, block: &ConvBlock) -> Value {
-        let y = self.conv(&format!("{path}.conv"), x, &block.conv, block.norm.as_ref());
-        self.node("Relu", &format!("{path}.relu"), &[&y], &[])
+    fn block(&mut self, x: &Value, block: &ConvBlock) -> Value {
+        let y = self.conv(x, &block.conv, block.norm.as_ref());
+        self.relu(&y)
     }
 
-    /// A level of an encoder: its skip, and what the level below gets.
-    fn descend(&mut self, path: &str, x: &Value, level: &EncoderLevel) -> (Value, Option<Value>) {
+    fn relu(&mut self, x: &Value) -> Value {
+        self.node("Relu", &format!("{}.relu", x.0), &[x], &[])
+    }
+
+    /// Adds a level of an encoder. Returns its skip and the input of the next level.
+    fn descend(&mut self, x: &Value, level: &EncoderLevel) -> (Value, Option<Value>) {
         let mut x = x.clone();
         let mut skip = None;
         for (j, conv) in level.convs.iter().enumerate() {
-            let y = self.conv(&format!("{path}.convs.{j}"), &x, conv, None);
-            x = self.node("Relu", &format!("{path}.relus.{j}"), &[&y], &[]);
+            let y = self.conv(&x, conv, None);
+            x = self.relu(&y);
             if j + 1 == level.skip_after {
                 skip = Some(x.clone());
             }
         }
         let settings = [
-            ("kernel_shape", Setting::Ints(&[2, 2])),
-            ("strides", Setting::Ints(&[2, 2])),
+            ("kernel_shape", AttributeValue::Ints(&[2, 2])),
+            ("strides", AttributeValue::Ints(&[2, 2])),
         ];
         let below = level
             .pooled
-            .then(|| self.node("MaxPool", &format!("{path}.pool"), &[&x], &settings));
+            .then(|| self.node("MaxPool", &format!("{}.pool", x.0), &[&x], &settings));
         (skip.expect("a level has a skip"), below)
     }
 
-    /// A level of the decoder: `[decoder | skips]`, fused (Eq. 2).
-    fn ascend(&mut self, path: &str, x: &Value, skips: Vec<Value>, level: &DecoderLevel) -> Value {
-        let name = format!("{path}.deconv");
-        let decoded = self.deconv(&name, x, &level.deconv, level.norm.as_ref());
-        let decoded = self.node("Relu", &format!("{path}.relu"), &[&decoded], &[]);
+    /// Adds a level of the decoder: `[decoder | skips]`, fused (Eq. 2).
+    fn ascend(&mut self, x: &Value, skips: Vec<Value>, level: &DecoderLevel) -> Value {
+        let decoded = self.deconv(x, &level.deconv, level.norm.as_ref());
+        let decoded = self.relu(&decoded);
         let parts: Vec<&Value> = std::iter::once(&decoded).chain(&skips).collect();
-        let all = self.concat(&format!("{path}.concat"), &parts);
-        let fused = self.conv(&format!("{path}.fuse"), &all, &level.fuse, None);
+        let all = self.concat(&format!("{}.concat", decoded.0), &parts);
+        let fused = self.conv(&all, &level.fuse, None);
         match level.activated_fusion {
-            true => self.node("Relu", &format!("{path}.fuse_relu"), &[&fused], &[]),
+            true => self.relu(&fused),
             false => fused,
         }
     }
 
-    /// Several values side by side; one is itself.
+    /// Concatenates values along the channels; a single value stays as it is.
     fn concat(&mut self, name: &str, parts: &[&Value]) -> Value {
         match parts {
             [one] => (*one).clone(),
-            _ => self.node("Concat", name, parts, &[("axis", Setting::Int(1))]),
+            _ => self.node("Concat", name, parts, &[("axis", AttributeValue::Int(1))]),
         }
     }
 
-    fn conv(&mut self, path: &str, x: &Value, conv: &Conv2d, norm: Option<&BatchNorm>) -> Value {
-        let [rows, columns] = conv.kernel_size;
-        let [outputs, inputs, ..] = conv.weight.val().dims();
-        let shape = [outputs, inputs, rows, columns];
-        let layers = [None, norm].map(|norm| Layer::conv(conv, norm));
-        let [weight, bias] = self.layer(path, shape, [outputs, 1, 1, 1], layers, norm);
-        // As `layers` of demc-model says: the size stays.
-        let [y, x_] = conv.kernel_size.map(|length| length / 2);
-        let settings = [
-            ("kernel_shape", Setting::Ints(&conv.kernel_size)),
-            ("pads", Setting::Ints(&[y, x_, y, x_])),
+    fn conv(&mut self, x: &Value, conv: &Conv2d, norm: Option<&BatchNorm>) -> Value {
+        let spec = self.spec(conv.weight.id);
+        let layers = [None, norm].map(|norm| FoldedConv::conv(conv, norm));
+        let [weight, bias] = self.layer(&spec, layers, norm);
+        // All convolutions of demc-model keep the size.
+        let [top, left] = conv.kernel_size.map(|length| length / 2);
+        let attributes = [
+            ("kernel_shape", AttributeValue::Ints(&conv.kernel_size)),
+            ("pads", AttributeValue::Ints(&[top, left, top, left])),
         ];
-        self.node("Conv", path, &[x, &weight, &bias], &settings)
+        self.node("Conv", spec.layer(), &[x, &weight, &bias], &attributes)
     }
 
-    fn deconv(
-        &mut self,
-        path: &str,
-        x: &Value,
-        deconv: &ConvTranspose2d,
-        norm: Option<&BatchNorm>,
-    ) -> Value {
-        let [inputs, outputs] = deconv.channels;
-        let [rows, columns] = deconv.kernel_size;
-        let shape = [inputs, outputs, rows, columns];
-        let layers = [None, norm].map(|norm| Layer::deconv(deconv, norm));
-        let [weight, bias] = self.layer(path, shape, [1, outputs, 1, 1], layers, norm);
-        let [y, x_] = deconv.padding;
-        let settings = [
-            ("kernel_shape", Setting::Ints(&deconv.kernel_size)),
-            ("pads", Setting::Ints(&[y, x_, y, x_])),
-            ("strides", Setting::Ints(&deconv.stride)),
+    fn deconv(&mut self, x: &Value, deconv: &ConvTranspose2d, norm: Option<&BatchNorm>) -> Value {
+        let spec = self.spec(deconv.weight.id);
+        let layers = [None, norm].map(|norm| FoldedConv::deconv(deconv, norm));
+        let [weight, bias] = self.layer(&spec, layers, norm);
+        let [top, left] = deconv.padding;
+        let attributes = [
+            ("kernel_shape", AttributeValue::Ints(&deconv.kernel_size)),
+            ("pads", AttributeValue::Ints(&[top, left, top, left])),
+            ("strides", AttributeValue::Ints(&deconv.stride)),
         ];
-        self.node("ConvTranspose", path, &[x, &weight, &bias], &settings)
+        self.node(
+            "ConvTranspose",
+            spec.layer(),
+            &[x, &weight, &bias],
+            &attributes,
+        )
     }
 
-    /// Weight and bias of a layer whose normalisation is folded into them; `layers` are the plain and the folded one.
+    /// Adds weight and bias of a layer, with the batch normalisation folded into them. `layers` are
+    /// the layer without and with folding.
     ///
-    /// In f16 the plain weights are stored, which a rounded bundle has, too, and what the normalisation multiplies them by
-    /// beside them: rounding folded ones would be another network. Runtimes multiply once, when they load the file.
+    /// In f16 the unfolded weights and the normalisation's scale are stored separately, and a node
+    /// multiplies them. Rounding folded weights would give another network than the f16 bundle.
+    /// Runtimes multiply once, when they load the file.
     fn layer(
         &mut self,
-        path: &str,
-        shape: [usize; 4],
-        by_output: [usize; 4],
-        layers: [Layer; 2],
+        spec: &WeightSpec,
+        [plain, folded]: [FoldedConv; 2],
         norm: Option<&BatchNorm>,
     ) -> [Value; 2] {
-        let [plain, folded] = layers;
-        let name = format!("{path}.weight");
+        let (name, path) = (&spec.name, spec.layer());
         let weight = match (self.precision(), norm) {
             (Precision::F16, Some(norm)) => {
-                let plain = self.kernel(&name, &shape, plain.weight());
-                let scale = self.constant(&format!("{path}.scale"), &by_output, &scale_of(norm));
+                let plain = self.kernel(name, &spec.shape, plain.weight());
+                let scale = norm_scale(norm);
+                let scale_shape = match spec.role {
+                    Role::Deconvolution => [1, scale.len(), 1, 1],
+                    _ => [scale.len(), 1, 1, 1],
+                };
+                let scale = self.constant(&format!("{path}.scale"), &scale_shape, &scale);
                 self.node("Mul", &format!("{name}.scaled"), &[&plain, &scale], &[])
             }
-            _ => self.kernel(&name, &shape, folded.weight()),
+            _ => self.kernel(name, &spec.shape, folded.weight()),
         };
         let bias = self.constant(&format!("{path}.bias"), &[folded.outputs()], folded.bias());
         [weight, bias]

@@ -1,44 +1,45 @@
-//! The messages of an ONNX file: what a network of ours needs of `onnx.proto`, with its field numbers. The only importer of
-//! `prost`.
+//! The messages of an ONNX file that this crate needs, with the field numbers of `onnx.proto`. The
+//! only importer of `prost`.
 //!
-//! Written out by hand: the crates that offer all of `onnx.proto` bring another protobuf runtime or an inference engine along
-//! for these ninety lines. Fields are those of <https://github.com/onnx/onnx/blob/main/onnx/onnx.proto>, a `proto2` file: one
-//! that can hold zero is an `Option`, because readers look at whether it is there.
+//! The messages are written by hand, because crates with all of `onnx.proto` depend on another
+//! protobuf runtime or an inference engine. They follow
+//! <https://github.com/onnx/onnx/blob/main/onnx/onnx.proto>, a `proto2` file: a field that can be
+//! zero is an `Option`, because readers test whether it is present.
 
 pub use prost::Message;
 
 /// `ModelProto`: the file.
 #[derive(Clone, PartialEq, Message)]
-pub struct Model {
+pub struct ModelProto {
     /// Version of the file format.
     #[prost(int64, tag = "1")]
     pub ir_version: i64,
-    /// Which program wrote it.
+    /// The program that wrote the file.
     #[prost(string, tag = "2")]
     pub producer_name: String,
-    /// And its version.
+    /// The program's version.
     #[prost(string, tag = "3")]
     pub producer_version: String,
     /// Version of the model itself.
     #[prost(int64, optional, tag = "5")]
     pub model_version: Option<i64>,
-    /// For people.
+    /// Documentation.
     #[prost(string, tag = "6")]
     pub doc_string: String,
     /// The network.
     #[prost(message, optional, tag = "7")]
-    pub graph: Option<Graph>,
-    /// The operators that it is made of.
+    pub graph: Option<GraphProto>,
+    /// The operator sets in use.
     #[prost(message, repeated, tag = "8")]
-    pub opset_import: Vec<OperatorSet>,
-    /// For programs.
+    pub opset_import: Vec<OperatorSetIdProto>,
+    /// Metadata for programs.
     #[prost(message, repeated, tag = "14")]
-    pub metadata_props: Vec<Entry>,
+    pub metadata_props: Vec<StringStringEntryProto>,
 }
 
 /// `OperatorSetIdProto`
 #[derive(Clone, PartialEq, Message)]
-pub struct OperatorSet {
+pub struct OperatorSetIdProto {
     /// Empty for ONNX's own operators.
     #[prost(string, optional, tag = "1")]
     pub domain: Option<String>,
@@ -49,7 +50,7 @@ pub struct OperatorSet {
 
 /// `StringStringEntryProto`
 #[derive(Clone, PartialEq, Message)]
-pub struct Entry {
+pub struct StringStringEntryProto {
     /// Its name.
     #[prost(string, tag = "1")]
     pub key: String,
@@ -60,57 +61,57 @@ pub struct Entry {
 
 /// `GraphProto`
 #[derive(Clone, PartialEq, Message)]
-pub struct Graph {
-    /// The operations, each after those whose values it takes.
+pub struct GraphProto {
+    /// The operations in topological order.
     #[prost(message, repeated, tag = "1")]
-    pub node: Vec<Node>,
+    pub node: Vec<NodeProto>,
     /// Its name.
     #[prost(string, tag = "2")]
     pub name: String,
     /// Constants.
     #[prost(message, repeated, tag = "5")]
-    pub initializer: Vec<Tensor>,
-    /// For people.
+    pub initializer: Vec<TensorProto>,
+    /// Documentation.
     #[prost(string, tag = "10")]
     pub doc_string: String,
-    /// What a caller gives.
+    /// The inputs.
     #[prost(message, repeated, tag = "11")]
-    pub input: Vec<ValueInfo>,
-    /// What a caller gets.
+    pub input: Vec<ValueInfoProto>,
+    /// The outputs.
     #[prost(message, repeated, tag = "12")]
-    pub output: Vec<ValueInfo>,
+    pub output: Vec<ValueInfoProto>,
 }
 
 /// `NodeProto`
 #[derive(Clone, PartialEq, Message)]
-pub struct Node {
-    /// Names of the values that it takes.
+pub struct NodeProto {
+    /// Names of the input values.
     #[prost(string, repeated, tag = "1")]
     pub input: Vec<String>,
-    /// Names of the values that it makes.
+    /// Names of the output values.
     #[prost(string, repeated, tag = "2")]
     pub output: Vec<String>,
-    /// Its own.
+    /// Its name.
     #[prost(string, tag = "3")]
     pub name: String,
     /// The operator.
     #[prost(string, tag = "4")]
     pub op_type: String,
-    /// The operator's settings.
+    /// The operator's attributes.
     #[prost(message, repeated, tag = "5")]
-    pub attribute: Vec<Attribute>,
+    pub attribute: Vec<AttributeProto>,
 }
 
 /// `AttributeProto` of one integer or several.
 #[derive(Clone, PartialEq, Message)]
-pub struct Attribute {
+pub struct AttributeProto {
     /// Its name.
     #[prost(string, tag = "1")]
     pub name: String,
-    /// Its value, where it is one.
+    /// The value of a single integer.
     #[prost(int64, optional, tag = "3")]
     pub i: Option<i64>,
-    /// Its values, where it is several.
+    /// The values of several integers.
     #[prost(int64, repeated, packed = "false", tag = "8")]
     pub ints: Vec<i64>,
     /// [`INT`] or [`INTS`].
@@ -118,14 +119,14 @@ pub struct Attribute {
     pub r#type: i32,
 }
 
-/// [`Attribute::type`] of one integer.
+/// [`AttributeProto::type`] of one integer.
 pub const INT: i32 = 2;
-/// [`Attribute::type`] of several integers.
+/// [`AttributeProto::type`] of several integers.
 pub const INTS: i32 = 7;
 
 /// `TensorProto`
 #[derive(Clone, PartialEq, Message)]
-pub struct Tensor {
+pub struct TensorProto {
     /// Its shape; empty for a scalar.
     #[prost(int64, repeated, packed = "false", tag = "1")]
     pub dims: Vec<i64>,
@@ -149,41 +150,41 @@ pub const INT64: i32 = 7;
 
 /// `ValueInfoProto`
 #[derive(Clone, PartialEq, Message)]
-pub struct ValueInfo {
+pub struct ValueInfoProto {
     /// Its name.
     #[prost(string, tag = "1")]
     pub name: String,
     /// Its type and shape.
     #[prost(message, optional, tag = "2")]
-    pub r#type: Option<Type>,
-    /// For people.
+    pub r#type: Option<TypeProto>,
+    /// Documentation.
     #[prost(string, tag = "3")]
     pub doc_string: String,
 }
 
 /// `TypeProto` of a tensor.
 #[derive(Clone, PartialEq, Message)]
-pub struct Type {
+pub struct TypeProto {
     /// The tensor.
     #[prost(message, optional, tag = "1")]
-    pub tensor_type: Option<TensorType>,
+    pub tensor_type: Option<TensorTypeProto>,
 }
 
 /// `TypeProto.Tensor`
 #[derive(Clone, PartialEq, Message)]
-pub struct TensorType {
+pub struct TensorTypeProto {
     /// [`FLOAT`].
     #[prost(int32, tag = "1")]
     pub elem_type: i32,
     /// Its axes.
     #[prost(message, optional, tag = "2")]
-    pub shape: Option<Shape>,
+    pub shape: Option<TensorShapeProto>,
 }
 
 /// `TensorShapeProto`
 #[derive(Clone, PartialEq, Message)]
-pub struct Shape {
-    /// One an axis.
+pub struct TensorShapeProto {
+    /// One entry per axis.
     #[prost(message, repeated, tag = "1")]
     pub dim: Vec<Dimension>,
 }
@@ -191,7 +192,7 @@ pub struct Shape {
 /// `TensorShapeProto.Dimension`
 #[derive(Clone, PartialEq, Message)]
 pub struct Dimension {
-    /// How long.
+    /// The length.
     #[prost(oneof = "Extent", tags = "1, 2")]
     pub value: Option<Extent>,
 }
@@ -199,10 +200,10 @@ pub struct Dimension {
 /// `TensorShapeProto.Dimension.value`
 #[derive(Clone, PartialEq, prost::Oneof)]
 pub enum Extent {
-    /// Always the same.
+    /// A fixed length.
     #[prost(int64, tag = "1")]
     Fixed(i64),
-    /// Any; the same wherever it has this name.
+    /// A free length; equal names have equal lengths.
     #[prost(string, tag = "2")]
     Named(String),
 }

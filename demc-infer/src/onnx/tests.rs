@@ -1,24 +1,24 @@
-//! What can be said about a graph without a runtime; `tests/tests/onnx_live.rs` runs it in one.
+//! Tests of the graph without a runtime; `tests/tests/onnx_live.rs` runs it in one.
 
 use std::collections::HashSet;
 
 use demc_model::Variant;
 
-use super::proto::{FLOAT16, Node};
+use super::proto::{FLOAT16, GraphProto, NodeProto};
 use super::*;
 use crate::bundle::testing::bundle;
 
-fn graph(variant: Variant, precision: Precision) -> proto::Graph {
+fn graph(variant: Variant, precision: Precision) -> GraphProto {
     let model = bundle(variant).onnx(precision).expect("a graph");
     model.graph.expect("there is one")
 }
 
-fn count(graph: &proto::Graph, op: &str) -> usize {
+fn count(graph: &GraphProto, op: &str) -> usize {
     graph.node.iter().filter(|node| node.op_type == op).count()
 }
 
 #[test]
-fn every_value_is_made_once_and_before_it_is_taken() {
+fn every_value_is_defined_once_and_before_its_use() {
     for variant in Variant::ALL {
         for precision in [Precision::F32, Precision::F16] {
             let graph = graph(variant, precision);
@@ -26,9 +26,9 @@ fn every_value_is_made_once_and_before_it_is_taken() {
             for constant in &graph.initializer {
                 assert!(known.insert(&constant.name), "{} twice", constant.name);
             }
-            for Node { input, output, .. } in &graph.node {
+            for NodeProto { input, output, .. } in &graph.node {
                 for name in input {
-                    assert!(known.contains(name.as_str()), "{name} before it is made");
+                    assert!(known.contains(name.as_str()), "{name} is not defined yet");
                 }
                 assert!(known.insert(&output[0]), "{} twice", output[0]);
             }
@@ -41,9 +41,10 @@ fn every_value_is_made_once_and_before_it_is_taken() {
     }
 }
 
-/// DEMC in the released reading: 4 blocks, 2 + 2 + 3 + 3 + 3 convolutions an encoder, the latent, 5 skip fusions, the head.
+/// DEMC in the released reading: 4 blocks, 2 + 2 + 3 + 3 + 3 convolutions per encoder, the latent,
+/// 5 skip fusions, the head.
 #[test]
-fn layers_are_those_of_the_network_and_no_normalisation_is_left() {
+fn the_graph_has_the_networks_layers_and_no_normalisation() {
     let graph = graph(Variant::Demc, Precision::F32);
     assert_eq!(count(&graph, "Conv"), 4 + 13 + 13 + 1 + 5 + 1);
     assert_eq!(count(&graph, "ConvTranspose"), 5);
@@ -55,10 +56,10 @@ fn layers_are_those_of_the_network_and_no_normalisation_is_left() {
 }
 
 #[test]
-fn f16_halves_what_kernels_take_and_nothing_else_is_f16() {
+fn f16_halves_the_kernels_and_nothing_else() {
     let [full, half] =
         [Precision::F32, Precision::F16].map(|precision| graph(Variant::Demc, precision));
-    let bytes = |graph: &proto::Graph, dims: usize| -> usize {
+    let bytes = |graph: &GraphProto, dims: usize| -> usize {
         let kernels = graph.initializer.iter();
         kernels
             .filter(|t| (t.dims.len() == dims) && !t.name.ends_with(".scale"))

@@ -1,4 +1,4 @@
-// Paired differences with their intervals, and a histogram for each metric.
+// Paired differences with their intervals, and one histogram per metric.
 {
   const against = [...new Set(data.differences.map((difference) => difference.against))];
   const words = (difference) => {
@@ -7,12 +7,12 @@
   };
   function sentence(name, rows) {
     const parts = [["better", "Better than"], ["worse", "Worse than"], ["not significant", "No significant difference from"]].flatMap(([word, phrase]) => {
-      const of = rows.filter((row) => words(row) === word).map((row) => row.metric);
-      return of.length ? `${phrase} ${name} in ${of.join(", ")}.` : [];
+      const metrics = rows.filter((row) => words(row) === word).map((row) => row.metric);
+      return metrics.length ? `${phrase} ${name} in ${metrics.join(", ")}.` : [];
     });
     return parts.join(" ");
   }
-  // Mean and interval on a scale of its own, zero in the middle, better to the left.
+  // Mean and interval. Each plot has its own scale, with zero in the middle and better to the left.
   function plot(difference) {
     const sign = cost(metricsByName.get(difference.metric), 1) > 0 ? 1 : -1;
     const [a, b] = difference.interval.map((end) => sign * end), mean = sign * difference.mean;
@@ -26,7 +26,7 @@
   }
   for (const name of against) {
     const rows = data.differences.filter((difference) => difference.against === name);
-    const head = ["metric", "difference", "95 % interval", "better ← → worse", "in words"].map((text, i) => make("th", { scope: "col", text, ...(i > 2 ? { style: i === 3 ? "text-align:center" : "text-align:left" } : {}) }));
+    const head = ["metric", "difference", "95 % interval", "better ← → worse", "result"].map((text, i) => make("th", { scope: "col", text, ...(i > 2 ? { style: i === 3 ? "text-align:center" : "text-align:left" } : {}) }));
     byId("difference-tables").append(make("div", {}, make("h3", { text: `denoised against ${name}, ${rows[0].images} images` }),
       make("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `differences from ${name}` }, make("table", {}, make("thead", {}, make("tr", {}, ...head)),
         make("tbody", {}, ...rows.map((difference) => make("tr", { title: difference.verdict },
@@ -38,9 +38,9 @@
       make("p", { class: "note", text: sentence(name, rows) })));
   }
   if (!against.length) byId("differences").hidden = true;
-  if (data.images.length < data.fewImages) byId("few").textContent = `Intervals from ${data.images.length} images are too narrow: what seems significant may not be.`;
+  if (data.images.length < data.fewImages) byId("few").textContent = `Intervals from ${data.images.length} images are too narrow: a difference marked significant may not be.`;
 
-  // Histograms: a row a method, on one axis.
+  // Histograms: one row per method on a common axis.
   const BINS = 22, WIDTH = 260, ROW = 24, LEFT = 58;
   function histogram(metric) {
     const methods = data.methods.filter((name) => name !== "black");

@@ -1,7 +1,8 @@
-//! Images as JPEG: HDR on a logarithmic curve, so that a page can change the exposure.
+//! Encodes HDR images as JPEG with a logarithmic curve, so that a page can change the exposure.
 //!
-//! `code = 255 log(1 + 64 x) / log(1 + 64 * 8)`: 28 codes a stop where 64 x is large, linear below. At an exposure of +3
-//! stops, x = 1/8 is white; at -3 stops, x = 8. In between, a step is at most 3 of 255 display codes at the usual exposure.
+//! `code = 255 log(1 + 64 x) / log(1 + 64 * 8)` has 28 codes per stop for large 64 x and is linear
+//! below. At +3 stops, x = 1/8 is white; at -3 stops, x = 8. At exposure 0, a step between codes is
+//! at most 3 of 255 display codes.
 
 use std::borrow::Cow;
 
@@ -10,30 +11,32 @@ use base64::engine::general_purpose::STANDARD;
 use jpeg_encoder::{ColorType, Encoder, EncodingError, SamplingFactor};
 use rayon::prelude::*;
 
-/// The largest value with a code of its own: what 3 stops less make white.
+/// Largest value of the curve: white at -3 stops.
 pub const WHITE: f32 = 8.0;
-/// One by the value below which the curve is linear.
+/// Inverse of the value below which the curve is linear.
 pub const TOE: f32 = 64.0;
 /// Qualities, best first.
 const QUALITIES: [u8; 8] = [92, 84, 74, 62, 50, 38, 26, 16];
-/// From this quality on, chroma keeps its resolution.
+/// Lowest quality with chroma in full resolution.
 const FULL_CHROMA: u8 = 84;
 
-/// 8-bit pixels: one or three values each, interleaved.
+/// 8-bit pixels with one or three interleaved values each.
 pub struct Pixels {
     pub width: usize,
     pub height: usize,
     pub values: Vec<u8>,
 }
 
-/// A JPEG file.
 pub struct Jpeg {
     pub quality: u8,
     bytes: Vec<u8>,
 }
 
 impl Pixels {
-    /// Linear HDR, planar `[3, height, width]`, on the logarithmic curve.
+    /// Encodes linear HDR with the logarithmic curve.
+    ///
+    /// # Shapes
+    /// `planes` is planar `[3, height, width]`.
     pub fn of_hdr(planes: &[f32], height: usize, width: usize) -> Self {
         let pixels = height * width;
         let mut values = vec![0; 3 * pixels];
@@ -57,7 +60,7 @@ impl Pixels {
         }
     }
 
-    /// As JPEG of the best quality of at most `bytes`, or of the worst where none is small enough.
+    /// A JPEG of the best quality that needs at most `bytes`, or of the worst quality if none does.
     ///
     /// # Errors
     /// An image without pixels.
@@ -66,7 +69,7 @@ impl Pixels {
         if best.len() <= bytes {
             return Ok(best);
         }
-        // Larger qualities make larger files: the first that fits, by halves.
+        // Bisection: higher qualities give larger files.
         let (mut low, mut high) = (1, QUALITIES.len() - 1);
         let mut fitting = None;
         while low < high {
@@ -85,7 +88,7 @@ impl Pixels {
         }
     }
 
-    /// As JPEG of this quality.
+    /// A JPEG of this quality.
     ///
     /// # Errors
     /// An image without pixels.
@@ -97,7 +100,7 @@ impl Pixels {
             FULL_CHROMA.. => SamplingFactor::F_1_1,
             _ => SamplingFactor::F_2_2,
         });
-        // No EXR file that is read has a longer side than 32768.
+        // Readable EXR files have sides of at most 32768 pixels.
         let side = |pixels: usize| u16::try_from(pixels).unwrap_or(u16::MAX);
         let (width, height) = (side(self.width), side(self.height));
         encoder.encode(&self.values, width, height, self.color())?;
@@ -106,12 +109,11 @@ impl Pixels {
 }
 
 impl Jpeg {
-    /// Size in bytes.
     pub fn len(&self) -> usize {
         self.bytes.len()
     }
 
-    /// As a `data:` address.
+    /// The file as a `data:` URL.
     pub fn url(&self) -> String {
         let mut url = "data:image/jpeg;base64,".to_owned();
         STANDARD.encode_string(&self.bytes, &mut url);
@@ -119,7 +121,6 @@ impl Jpeg {
     }
 }
 
-/// A radiance on the curve.
 fn code(x: f32) -> u8 {
     let full = (1.0 + TOE * WHITE).log2();
     ((1.0 + TOE * x.max(0.0)).log2() / full * 255.0)
@@ -127,7 +128,8 @@ fn code(x: f32) -> u8 {
         .min(255.0) as u8
 }
 
-/// Planar channels, each the mean of blocks of `side` x `side` pixels; a block at the edge has fewer.
+/// Planar channels reduced to means of blocks of `side` x `side` pixels; blocks at the edge are
+/// smaller.
 pub fn reduced(planes: &[f32], height: usize, width: usize, side: usize) -> Cow<'_, [f32]> {
     if side == 1 {
         return planes.into();
@@ -152,7 +154,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_curve_starts_at_black_ends_at_white_and_has_steps_of_three_codes() {
+    fn the_curve_runs_from_black_to_white_in_steps_below_three_display_codes() {
         assert_eq!(
             [code(-1.0), code(0.0), code(WHITE), code(1e9)],
             [0, 0, 255, 255]
@@ -162,7 +164,7 @@ mod tests {
         for i in 0..255_u8 {
             let (x, next) = (radiance(i.into()), radiance(f32::from(i) + 1.0));
             assert_eq!(code(x), i);
-            // From 0.02 on; darker, the display's own curve is too steep for any 8 bits of more than 1.
+            // Below 0.02, the display's curve is too steep for 8 bits.
             if x > 0.02 {
                 assert!(display(next) - display(x) < 3.0, "{i}");
             }

@@ -1,4 +1,4 @@
-// The numbers, and small helpers to build elements. Text is only ever set as text.
+// The numbers, and helpers that build elements. Text is never set as HTML.
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
 
@@ -29,7 +29,7 @@ function number(value, signed = false) {
 }
 
 const metricsByName = new Map(data.metrics.map((metric) => [metric.name, metric]));
-// A value on a scale where less is better.
+// The value on a scale where smaller is better.
 function cost(metric, value) {
   return { lower: value, higher: -value, zero: Math.abs(value) }[metric.better];
 }

@@ -1,31 +1,30 @@
-//! Where an image is wrong: the error of each pixel whose mean is `relmse`, and the patches that are worst and typical.
+//! Error maps: the error of each pixel, whose mean is `relmse`, and the worst and the median patch.
 
 use demc_model::metrics::{Image, rel_mse_map};
 
 use super::codec::{Pixels, reduced};
 
-/// Ends of the colour scale, which is logarithmic.
+/// Ends of the logarithmic colour scale.
 pub const SCALE: [f32; 2] = [1e-3, 1e1];
-/// Longest side of an error map, px: beyond it, means of blocks are shown.
+/// Longest side of an error map in pixels; larger maps show means of blocks.
 const LONGEST: usize = 640;
-/// Side of a patch, px.
+/// Side of a patch in pixels.
 const PATCH: usize = 48;
 
-/// The error of each pixel.
 pub struct ErrorMap {
     width: usize,
     height: usize,
     errors: Vec<f32>,
 }
 
-/// A square of pixels, or less where the image is smaller.
+/// A square of pixels, or less if the image is smaller.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Patch {
+pub struct ErrorPatch {
     pub x: usize,
     pub y: usize,
     pub width: usize,
     pub height: usize,
-    /// Its own `relmse`.
+    /// Its `relmse`.
     pub relmse: f64,
 }
 
@@ -40,12 +39,12 @@ impl ErrorMap {
         }
     }
 
-    /// Side of the blocks whose means are shown.
+    /// Side of the blocks whose means are shown, in pixels.
     pub fn block(&self) -> usize {
         self.width.max(self.height).div_ceil(LONGEST)
     }
 
-    /// The map on its scale; blocks are averaged before the logarithm.
+    /// The map on the colour scale; blocks are averaged before the logarithm.
     pub fn pixels(&self) -> Pixels {
         let block = self.block();
         let errors = reduced(&self.errors, self.height, self.width, block);
@@ -56,8 +55,8 @@ impl ErrorMap {
         }
     }
 
-    /// The part of it that a patch covers, pixel by pixel.
-    pub fn crop(&self, patch: &Patch) -> Pixels {
+    /// The part of the map in a patch, at full resolution.
+    pub fn crop(&self, patch: &ErrorPatch) -> Pixels {
         Pixels {
             width: patch.width,
             height: patch.height,
@@ -68,18 +67,18 @@ impl ErrorMap {
     }
 
     /// The patches of a grid with the largest and with the median error.
-    pub fn worst_and_median(&self) -> [Patch; 2] {
+    pub fn worst_and_median(&self) -> [ErrorPatch; 2] {
         let side = |pixels: usize| (pixels.min(PATCH), (pixels / PATCH).max(1));
         let ((width, columns), (height, rows)) = (side(self.width), side(self.height));
-        // The grid is centred: what is left over is at both edges.
+        // The grid is centred; the remainder is at both edges.
         let start = |pixels: usize, size: usize, count: usize| (pixels - size * count) / 2;
         let (left, top) = (
             start(self.width, width, columns),
             start(self.height, height, rows),
         );
-        let mut patches: Vec<Patch> = (0..rows * columns)
+        let mut patches: Vec<ErrorPatch> = (0..rows * columns)
             .map(|i| {
-                let mut patch = Patch {
+                let mut patch = ErrorPatch {
                     x: left + i % columns * width,
                     y: top + i / columns * height,
                     width,
@@ -96,8 +95,8 @@ impl ErrorMap {
     }
 }
 
-impl Patch {
-    /// This part of a planar `[3, H, W]`.
+impl ErrorPatch {
+    /// This part of a planar `[3, H, W]` image.
     pub fn of_planes(&self, planes: &[f32], width: usize) -> Vec<f32> {
         let planes = planes.chunks(planes.len() / 3);
         planes
@@ -106,17 +105,17 @@ impl Patch {
     }
 }
 
-fn cropped(plane: &[f32], width: usize, patch: &Patch) -> impl Iterator<Item = f32> {
+fn cropped(plane: &[f32], width: usize, patch: &ErrorPatch) -> impl Iterator<Item = f32> {
     let lines = plane.chunks(width).skip(patch.y).take(patch.height);
     let columns = patch.x..patch.x + patch.width;
     lines.flat_map(move |line| line[columns.clone()].iter().copied())
 }
 
-/// An error on the scale, 0 to 255.
+/// An error on the colour scale, 0 to 255.
 fn shade(error: f32) -> u8 {
     let [low, high] = SCALE;
-    let place = (error.max(low) / low).log10() / (high / low).log10();
-    (place * 255.0).round().min(255.0) as u8
+    let position = (error.max(low) / low).log10() / (high / low).log10();
+    (position * 255.0).round().min(255.0) as u8
 }
 
 #[cfg(test)]
@@ -142,14 +141,14 @@ mod tests {
             errors,
         };
         let [worst, median] = map.worst_and_median();
-        // Two rows of four patches, centred: from 2 and from 4 on.
+        // Two rows of four patches, centred: they start at 2 and at 4.
         assert_eq!((worst.x, worst.y), (4 + 2 * PATCH, 2 + PATCH));
         assert!(worst.relmse > 100.0 && median.relmse == 1.0);
         assert_eq!(map.crop(&worst).values.iter().max(), Some(&255));
     }
 
     #[test]
-    fn an_image_below_a_patch_is_one_patch_and_a_large_map_is_averaged() {
+    fn a_small_image_is_one_patch_and_a_large_map_is_averaged() {
         let map = |height, width| ErrorMap {
             width,
             height,

@@ -1,8 +1,8 @@
-//! One HTML file about a model: its images beside the noisy ones, the references and other programs', and all numbers.
+//! The HTML report: one file with denoised, noisy, reference and baseline images, and all scores.
 //!
-//! The page is `page.html` with `style.css` and the scripts in it, the numbers as JSON, and each scene's pictures as JSON of
-//! their own that is parsed when the scene is looked at. Every name goes through JSON and `textContent`, never through
-//! HTML. A content security policy forbids it the network.
+//! The page consists of `page.html`, `style.css`, the scripts, and the numbers as JSON. Each
+//! scene's pictures are separate JSON, parsed when the scene is selected. Names go through JSON and
+//! `textContent`, never through HTML. A content security policy forbids network access.
 
 mod codec;
 mod error_map;
@@ -14,65 +14,64 @@ use serde_json::json;
 
 use crate::denoise::DenoiseError;
 use crate::evaluate::{FEW_IMAGES, ImageScore, Report};
-pub use views::{Encoded, Views};
+pub use views::{EncodedScene, SceneImages};
 
-/// Bytes of all pictures before base64, which makes 4 of 3: the page stays below 20 MB.
+/// Bytes of all pictures before base64, which adds a third. The page stays below 20 MB.
 const BUDGET: usize = 14_000_000;
 
 const TEMPLATE: &str = include_str!("page.html");
 const STYLE: &str = include_str!("style.css");
-const SCRIPTS: [&str; 5] = [
+const SCRIPTS: [&str; 4] = [
     include_str!("dom.js"),
     include_str!("viewer.js"),
-    include_str!("insets.js"),
     include_str!("tables.js"),
     include_str!("charts.js"),
 ];
 
-/// Why a page could not be made.
+/// Why a report cannot be made.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ReportError {
-    /// A picture could not be encoded.
+    /// A picture cannot be encoded.
     #[error("{name}: its pictures cannot be encoded")]
     Encoding {
         /// The image.
         name: String,
-        /// What the encoder said.
+        /// The encoder's error.
         source: jpeg_encoder::EncodingError,
     },
-    /// There is no reference, or an image that cannot be compared with it.
+    /// The reference is missing, or an image cannot be compared with it.
     #[error(transparent)]
     Images(#[from] DenoiseError),
-    /// The numbers could not be written.
-    #[error("the report's JSON")]
+    /// The numbers cannot be written as JSON.
+    #[error("cannot encode the report's JSON")]
     Json(#[from] serde_json::Error),
 }
 
-/// What a page is about.
+/// The subject of a report.
 #[derive(Debug, Clone, Serialize)]
 pub struct About {
-    /// What computed the denoised images.
+    /// The model behind the denoised images.
     pub model: String,
     /// The data set.
     pub data: String,
-    /// Its part.
+    /// The data set's split.
     pub split: String,
 }
 
-/// A page under way. Holds encoded pictures only.
+/// A report under construction. Holds only encoded pictures.
 #[derive(Default)]
-pub struct Page {
+pub struct ReportPage {
     images: Vec<serde_json::Value>,
     pictures: Vec<String>,
 }
 
-impl Page {
+impl ReportPage {
     /// Adds a scene's pictures and its `score`.
     ///
     /// # Errors
     /// [`ReportError::Json`].
-    pub fn add(&mut self, encoded: Encoded, score: &ImageScore) -> Result<(), ReportError> {
+    pub fn add(&mut self, encoded: EncodedScene, score: &ImageScore) -> Result<(), ReportError> {
         self.images.push(json!({
             "name": score.name,
             "width": encoded.width,
@@ -87,7 +86,7 @@ impl Page {
         Ok(())
     }
 
-    /// The file, with what `report` says of all scenes.
+    /// The HTML file, with the scores of `report`.
     ///
     /// # Errors
     /// [`ReportError::Json`].
@@ -126,7 +125,7 @@ impl Page {
     }
 }
 
-/// Scores by the name of what was scored.
+/// Scores by method.
 fn by_name(methods: &[(&str, &crate::Score)]) -> Result<serde_json::Value, serde_json::Error> {
     let scores = methods.iter().map(|(name, score)| {
         let score = serde_json::to_value(score)?;
@@ -135,7 +134,7 @@ fn by_name(methods: &[(&str, &crate::Score)]) -> Result<serde_json::Value, serde
     Ok(serde_json::Value::Object(scores.collect::<Result<_, _>>()?))
 }
 
-/// JSON that cannot end the script element around it.
+/// JSON that cannot end its script element.
 fn script_json(value: &impl Serialize) -> Result<String, serde_json::Error> {
     Ok(serde_json::to_string(value)?.replace('<', "\\u003c"))
 }
@@ -144,7 +143,8 @@ fn element(id: &str, json: &str) -> String {
     format!("<script type=\"application/json\" id=\"{id}\">{json}</script>\n")
 }
 
-/// The template with each mark replaced, in the order of the marks. What was put in is not looked at again.
+/// The template with each mark replaced, in the order of the marks. Marks in inserted text are
+/// ignored.
 fn filled(template: &str, parts: &[(&str, &str)]) -> String {
     let mut rest = template;
     let mut out = String::new();
@@ -162,19 +162,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn no_name_ends_its_script_element() {
+    fn names_cannot_end_their_script_element() {
         let mut frame = crate::bundle::testing::frame(60, 50);
         frame.reference = Some(frame.color.iter().map(|x| x + 0.1).collect());
         frame.name = "</script><script>alert(1)</script>{{script}}".into();
         let planes = frame.color.clone();
         let baselines = [("<b>&amp;", planes.as_slice())];
         let score = ImageScore::full(&frame, &planes, &baselines, None).expect("scored");
-        let views = Views {
+        let views = SceneImages {
             frame: &frame,
             denoised: &planes,
             baselines: &baselines,
         };
-        let mut page = Page::default();
+        let mut page = ReportPage::default();
         page.add(views.encode(1).expect("encoded"), &score)
             .expect("added");
         let about = About {
@@ -200,13 +200,13 @@ mod tests {
     }
 
     #[test]
-    fn pictures_are_made_of_what_can_be_compared_only() {
+    fn images_that_cannot_be_compared_are_refused() {
         let mut frame = crate::bundle::testing::frame(50, 44);
         let planes = frame.color.clone();
         let mut bad = planes.clone();
         bad[3] = f32::NAN;
         let encode = |frame: &demc_data::Frame, denoised: &[f32]| {
-            let views = Views {
+            let views = SceneImages {
                 frame,
                 denoised,
                 baselines: &[],

@@ -1,10 +1,10 @@
-// The means, and a table of every image and method that sorts by any column.
+// The table of means, and the sortable table of all images and methods.
 {
   const arrowOf = { lower: "lower is better", higher: "higher is better", zero: "best near zero" };
   const head = (metric) => make("th", { scope: "col", title: metric.definition }, metric.name, make("span", { class: "better", text: arrowOf[metric.better] }));
   const cell = (value, best) => make("td", { class: !isValue(value) ? "none" : best ? "best" : "", text: number(value) });
 
-  // Means: a row a method.
+  // Means: one row per method.
   const best = new Map(data.metrics.map((metric) => {
     const values = data.methods.map((name) => data.mean[name][metric.name]).filter(isValue);
     return [metric.name, Math.min(...values.map((value) => cost(metric, value)))];
@@ -20,16 +20,16 @@
   const residuals = data.images.map((image) => image.residual).filter(isValue);
   if (residuals.length) {
     const mean = residuals.reduce((a, b) => a + b) / residuals.length;
-    byId("residual").textContent = `The references have noise of their own: their relmse against a perfect image is ${number(mean)} in the mean, and a score near that means nothing.`;
+    byId("residual").textContent = `The references contain noise: their mean relmse against a noise-free image is ${number(mean)}. A score near that value has no meaning.`;
   }
 
-  // Each image.
+  // Scores per image.
   const rows = data.images.flatMap((image, i) => data.methods.map((method) => ({ image: image.name, i, method, residual: image.residual, scores: image.scores[method] })));
   const columns = [
     { name: "image", value: (row) => row.image, text: true },
     { name: "method", value: (row) => row.method, text: true },
     ...data.metrics.map((metric) => ({ name: metric.name, title: metric.definition, value: (row) => row.scores[metric.name] })),
-    { name: "residual", title: "relmse of the reference against a perfect image", value: (row) => row.residual },
+    { name: "residual", title: "relmse of the reference against a noise-free image", value: (row) => row.residual },
   ];
   let sorted = { column: null, down: false };
   const compare = (column, down) => (a, b) => {
@@ -60,10 +60,10 @@
     const shown = rows.filter((row) => !only || row.method === only);
     if (sorted.column) shown.sort(compare(sorted.column, sorted.down));
     for (const { th, arrow, column } of headers) {
-      const here = column === sorted.column;
-      if (here) th.setAttribute("aria-sort", sorted.down ? "descending" : "ascending");
+      const active = column === sorted.column;
+      if (active) th.setAttribute("aria-sort", sorted.down ? "descending" : "ascending");
       else th.removeAttribute("aria-sort");
-      arrow.textContent = here ? (sorted.down ? "▼" : "▲") : "";
+      arrow.textContent = active ? (sorted.down ? "▼" : "▲") : "";
     }
     body.replaceChildren(...shown.map((row) => {
       const button = make("button", { type: "button", class: "link", text: row.image, title: "Show this image" });

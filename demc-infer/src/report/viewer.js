@@ -1,4 +1,4 @@
-// The comparison: two layers of one image, a divider, exposure. Layers are named "noisy", ... and "error:noisy", ...
+// The viewer: two layers of one image, a divider, exposure. Layers are called "noisy", ... and "error:noisy", ...
 const viewer = (() => {
   const stage = byId("stage"), divider = byId("divider"), exposure = byId("exposure");
   const sides = { left: byId("canvas-left"), right: byId("canvas-right") };
@@ -10,7 +10,7 @@ const viewer = (() => {
   const listeners = [];
   const decoded = new Map();
 
-  // Code -> display byte at an exposure: the file's logarithmic curve back to radiance, then clip and gamma.
+  // Code -> display byte at an exposure: invert the logarithmic curve, then clip and gamma.
   function exposureTable(stops) {
     const { white, toe } = data.curve;
     return Uint8ClampedArray.from({ length: 256 }, (_, code) => {
@@ -18,7 +18,7 @@ const viewer = (() => {
       return 255 * Math.pow(Math.min(1, radiance * 2 ** stops), 1 / 2.2);
     });
   }
-  // Inferno, by 9 of its colours.
+  // The colour map "inferno", interpolated between 9 of its colours.
   const heat = (() => {
     const stops = [[0, 0, 4], [31, 12, 72], [85, 15, 109], [136, 34, 106], [186, 54, 85], [227, 89, 51], [249, 140, 10], [249, 201, 50], [252, 255, 164]];
     return Array.from({ length: 256 }, (_, code) => {
@@ -28,7 +28,7 @@ const viewer = (() => {
   })();
   let table = exposureTable(0);
 
-  // The codes of a picture, decoded once while its image is shown.
+  // The codes of a picture, decoded once while its image is selected.
   async function codes(url) {
     if (!decoded.has(url)) {
       decoded.set(url, (async () => {
@@ -81,14 +81,14 @@ const viewer = (() => {
     sides.left.style.clipPath = `inset(0 ${100 - position}% 0 0)`;
     divider.style.left = `${position}%`;
     divider.setAttribute("aria-valuenow", Math.round(position));
-    divider.setAttribute("aria-valuetext", `${Math.round(position)} % ${label(chosen.left)}, the rest ${label(chosen.right)}`);
+    divider.setAttribute("aria-valuetext", `${Math.round(position)} % ${label(chosen.left)}, then ${label(chosen.right)}`);
   }
 
   function fit() {
     const info = data.images[image];
     const room = byId("viewing").clientWidth;
     const height = Math.max(240, Math.min(window.innerHeight * 0.82, 800));
-    // Small images grow by whole numbers, so that all pixels have one size.
+    // Small images are enlarged by whole factors, so that all pixels have the same size.
     const fits = Math.min(room / info.width, height / info.height);
     const scale = fits >= 2 ? Math.floor(fits) : fits;
     stage.classList.toggle("large", scale > 1);
@@ -112,7 +112,7 @@ const viewer = (() => {
     byId("caption").replaceChildren(make("strong", { text: info.name }), make("div", {
       text: `${info.width} × ${info.height}, picture ${image + 1} of ${data.images.length}, JPEG quality ${worst === best ? best : `${worst} to ${best}`}`,
     }));
-    byId("scale-note").textContent = info.block > 1 ? `Means of ${info.block} × ${info.block} pixels; not changed by exposure.` : "Pixel by pixel; not changed by exposure.";
+    byId("scale-note").textContent = info.block > 1 ? `Means of ${info.block} × ${info.block} pixels; independent of exposure.` : "One value per pixel; independent of exposure.";
   }
 
   function show(index) {
@@ -157,7 +157,7 @@ const viewer = (() => {
     if (step) { place(position + step); event.preventDefault(); }
   });
   stage.addEventListener("pointerdown", (event) => {
-    const move = (at) => { const box = stage.getBoundingClientRect(); place(100 * (at.clientX - box.left) / box.width); };
+    const move = (pointer) => { const box = stage.getBoundingClientRect(); place(100 * (pointer.clientX - box.left) / box.width); };
     const end = () => { stage.removeEventListener("pointermove", move); };
     stage.setPointerCapture(event.pointerId);
     stage.addEventListener("pointermove", move);
@@ -180,3 +180,32 @@ const viewer = (() => {
   }
   return { show, layers, label, paintLayer, patches: () => pictures.patches, onDraw: (listener) => listeners.push(listener), image: () => image };
 })();
+
+// The worst and the median patch of the selected image in every layer, at full resolution.
+{
+  let built = -1, canvases = [];
+  const build = () => {
+    canvases = [];
+    const rows = viewer.patches().map((patch) => {
+      const title = make("h3", { text: patch.kind === "worst" ? "Worst patch " : "Median patch " },
+        make("span", { text: `${patch.width} × ${patch.height} pixels at ${patch.x}, ${patch.y}; relmse of denoised ${number(patch.relmse)}` }));
+      // Errors are below their pictures.
+      const row = make("div", { class: "row" });
+      const pictures = viewer.layers.filter((layer) => !layer.startsWith("error:"));
+      row.style.setProperty("--count", pictures.length);
+      for (const layer of [...pictures, ...pictures.map((name) => `error:${name}`).filter((layer) => viewer.layers.includes(layer))]) {
+        const canvas = make("canvas", { role: "img", "aria-label": `${patch.kind} patch, ${viewer.label(layer)}`, width: patch.width, height: patch.height });
+        canvases.push([canvas, layer, patch]);
+        const caption = layer.startsWith("error:") ? "error" : layer;
+        row.append(make("figure", {}, canvas, make("figcaption", { text: caption, title: viewer.label(layer) })));
+      }
+      return make("div", {}, title, row);
+    });
+    byId("insets").replaceChildren(...rows);
+  };
+  viewer.onDraw(() => {
+    if (built !== viewer.image()) { built = viewer.image(); build(); }
+    for (const [canvas, layer, patch] of canvases) viewer.paintLayer(canvas, layer, patch);
+  });
+  viewer.show(0);
+}

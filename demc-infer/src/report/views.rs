@@ -1,4 +1,4 @@
-//! All pictures of one scene, encoded.
+//! Encodes all pictures of one scene.
 
 use std::collections::BTreeMap;
 
@@ -8,37 +8,37 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::codec::{Jpeg, Pixels, reduced};
-use super::error_map::ErrorMap;
+use super::error_map::{ErrorMap, ErrorPatch};
 use super::{BUDGET, ReportError};
 use crate::denoise::DenoiseError;
 use crate::evaluate::{image_of, reference_of};
 
-/// Quality of the patches, which are small and looked at closely.
+/// JPEG quality of the patches, which are shown enlarged.
 const PATCH_QUALITY: u8 = 95;
-/// Quality of the thumbnails.
+/// JPEG quality of the thumbnails.
 const THUMBNAIL_QUALITY: u8 = 80;
-/// Longest side of a thumbnail, px.
+/// Longest side of a thumbnail in pixels.
 const THUMBNAIL: usize = 144;
-/// Shares of a scene's bytes: a clean picture, an error map, and the noisy picture, which compresses worst and comes last, so
-/// that it has what the others leave.
+/// Shares of a scene's bytes for a clean picture, an error map and the noisy picture. The noisy
+/// picture compresses worst. It comes last and gets the remaining bytes.
 const CLEAN: usize = 2;
 const ERRORS: usize = 1;
 const NOISY: usize = 4;
 
 /// A scene's images, planar `[3, H, W]` in linear HDR.
-pub struct Views<'a> {
+pub struct SceneImages<'a> {
     /// Noisy image and reference.
     pub frame: &'a Frame,
     /// The network's output.
     pub denoised: &'a [f32],
-    /// Other programs' outputs by name.
+    /// Baseline images by name.
     pub baselines: &'a [(&'a str, &'a [f32])],
 }
 
-/// `data:` addresses by name.
+/// `data:` URLs by name.
 type Urls = BTreeMap<String, String>;
 
-/// What the page decodes when the scene is chosen.
+/// The pictures that the page decodes when the scene is selected.
 #[derive(Serialize)]
 pub struct Pictures {
     pictures: Urls,
@@ -46,7 +46,7 @@ pub struct Pictures {
     patches: [Inset; 2],
 }
 
-/// A part of the scene, pixel by pixel.
+/// A part of the scene at full resolution.
 #[derive(Serialize)]
 struct Inset {
     kind: &'static str,
@@ -54,14 +54,14 @@ struct Inset {
     y: usize,
     width: usize,
     height: usize,
-    /// Of the denoised image in it.
+    /// RelMSE of the denoised image in this part.
     relmse: f64,
     pictures: Urls,
     errors: Urls,
 }
 
-/// A scene's pictures, and what is needed of them before it is chosen.
-pub struct Encoded {
+/// A scene's pictures, and the data that the page needs before the scene is selected.
+pub struct EncodedScene {
     pub(super) width: usize,
     pub(super) height: usize,
     pub(super) pictures: Pictures,
@@ -72,20 +72,20 @@ pub struct Encoded {
     pub(super) quality: [u8; 2],
 }
 
-impl Views<'_> {
-    /// Every image but the reference, by name.
+impl SceneImages<'_> {
+    /// Every image except the reference, by name.
     fn candidates(&self) -> Vec<(&str, &[f32])> {
-        let ours = [("noisy", self.frame.color.as_slice())];
+        let first = [("noisy", self.frame.color.as_slice())];
         let last = [("denoised", self.denoised)];
         let baselines = self.baselines.iter().copied();
-        ours.into_iter().chain(baselines).chain(last).collect()
+        first.into_iter().chain(baselines).chain(last).collect()
     }
 
-    /// Encodes everything in this scene's share of a page of so many `scenes`.
+    /// Encodes all pictures within this scene's share of a page of `scenes` scenes.
     ///
     /// # Errors
-    /// No reference, values that are not finite, an image that is too large for JPEG.
-    pub fn encode(&self, scenes: usize) -> Result<Encoded, ReportError> {
+    /// The reference is missing, a value is not finite, or an image is too large for JPEG.
+    pub fn encode(&self, scenes: usize) -> Result<EncodedScene, ReportError> {
         let reference = reference_of(self.frame)?;
         let maps = self.candidates().into_par_iter().map(|(name, planes)| {
             let candidate = image_of(self.frame, name, planes)?;
@@ -104,18 +104,18 @@ impl Views<'_> {
         reference_hdr: &[f32],
         maps: &[(&str, ErrorMap)],
         budget: usize,
-    ) -> Result<Encoded, EncodingError> {
+    ) -> Result<EncodedScene, EncodingError> {
         let Frame { width, height, .. } = *self.frame;
         let candidates = self.candidates();
-        let (_, of_denoised) = maps.last().expect("there is the denoised image");
+        let (_, denoised_map) = maps.last().expect("the denoised image is last");
         let all: Vec<(&str, &[f32])> = candidates
             .iter()
             .copied()
             .chain([("reference", reference_hdr)])
             .collect();
 
-        let [worst, median] = of_denoised.worst_and_median();
-        let inset = |kind, patch: super::error_map::Patch| -> Result<Inset, EncodingError> {
+        let [worst, median] = denoised_map.worst_and_median();
+        let inset = |kind, patch: ErrorPatch| -> Result<Inset, EncodingError> {
             let picture = |(name, planes): &(&str, &[f32])| -> Result<_, EncodingError> {
                 let part = patch.of_planes(planes, width);
                 let pixels = Pixels::of_hdr(&part, patch.height, patch.width);
@@ -137,11 +137,11 @@ impl Views<'_> {
             })
         };
         let patches = [inset("worst", worst)?, inset("median", median)?];
-        let of_patches: usize = patches.iter().map(Inset::bytes).sum();
+        let patch_bytes: usize = patches.iter().map(Inset::bytes).sum();
 
         let shares = CLEAN * (all.len() - 1) + ERRORS * maps.len() + NOISY;
-        let mut purse = Purse {
-            left: budget.saturating_sub(of_patches),
+        let mut bytes = ByteBudget {
+            left: budget.saturating_sub(patch_bytes),
             shares,
             quality: [u8::MAX, 0],
         };
@@ -151,14 +151,14 @@ impl Views<'_> {
         };
         let error = |(name, map): &(&str, ErrorMap)| ((*name).to_owned(), map.pixels());
         // The noisy picture is first in the list.
-        let mut pictures = purse.spend(all[1..].iter().map(hdr).collect(), CLEAN)?;
-        let errors = purse.spend(maps.iter().map(error).collect(), ERRORS)?;
-        pictures.extend(purse.spend(vec![hdr(&all[0])], NOISY)?);
+        let mut pictures = bytes.encode(all[1..].iter().map(hdr).collect(), CLEAN)?;
+        let errors = bytes.encode(maps.iter().map(error).collect(), ERRORS)?;
+        pictures.extend(bytes.encode(vec![hdr(&all[0])], NOISY)?);
 
         let side = width.max(height).div_ceil(THUMBNAIL);
         let small = reduced(self.denoised, height, width, side);
         let thumbnail = Pixels::of_hdr(&small, height.div_ceil(side), width.div_ceil(side));
-        Ok(Encoded {
+        Ok(EncodedScene {
             width,
             height,
             pictures: Pictures {
@@ -167,8 +167,8 @@ impl Views<'_> {
                 patches,
             },
             thumbnail: thumbnail.jpeg(THUMBNAIL_QUALITY)?.url(),
-            block: of_denoised.block(),
-            quality: purse.quality,
+            block: denoised_map.block(),
+            quality: bytes.quality,
         })
     }
 }
@@ -181,16 +181,19 @@ impl Inset {
     }
 }
 
-/// The bytes that are left for those that still come.
-struct Purse {
+/// Distributes a scene's bytes over its pictures.
+struct ByteBudget {
+    /// Bytes for the remaining pictures.
     left: usize,
+    /// Shares of the remaining pictures.
     shares: usize,
+    /// Worst and best quality so far.
     quality: [u8; 2],
 }
 
-impl Purse {
-    /// Pictures of one kind, of so many shares each, as JPEG.
-    fn spend(
+impl ByteBudget {
+    /// Encodes pictures as JPEG, each with this number of shares.
+    fn encode(
         &mut self,
         pictures: Vec<(String, Pixels)>,
         shares: usize,

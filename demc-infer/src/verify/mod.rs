@@ -1,43 +1,52 @@
-//! Whether an exported file computes what this program does: it is run where it will be used, through Python, on synthetic
-//! frames, and compared.
-
-mod synthetic;
+//! Verifies an exported file: Python runs it on synthetic frames, in ONNX Runtime or PyTorch, and
+//! the output is compared with this program's.
 
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-use rand::SeedableRng;
+use demc_data::frame::FEATURES;
+use demc_data::{FeatureStats, Frame};
+use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::bundle::tensors::f32_bytes;
 use crate::{Bundle, DenoiseError};
 
-/// Largest deviation that passes.
+/// Largest accepted deviation.
 pub const TOLERANCE: f32 = 1e-4;
-/// Images, height and width of the batches that are compared: square, neither, and several at a time.
+/// Images, height and width of the compared batches: square and not, one image and two.
 pub const SIZES: [[usize; 3]; 4] = [[1, 32, 32], [1, 96, 160], [2, 224, 32], [1, 256, 256]];
 /// Epsilon of RelMSE (Eq. 5).
 const RELMSE_EPSILON: f32 = 0.001;
-/// What the frames are drawn from.
+/// Seed of the frames.
 const SEED: u64 = 20190101;
-/// Exit code of the script where a package is missing.
+/// Exit code of the script for a missing package.
 const NO_PACKAGE: i32 = 3;
 const SCRIPT: &str = include_str!("run.py");
+/// Share of black pixels of a synthetic frame: paths that found no light.
+const BLACK: f32 = 0.3;
+/// Share of fireflies.
+const FIREFLIES: f32 = 0.005;
+/// Radiance of fireflies, as powers of ten.
+const FIREFLY_EXPONENTS: std::ops::Range<f32> = 1.0..3.0;
+/// Side of an object in pixels. Features are smooth within an object and jump between objects.
+const OBJECT: usize = 11;
 
-/// What runs the file.
+/// The software that runs the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Runtime {
-    /// An ONNX file.
+    /// ONNX Runtime, for an ONNX file.
     OnnxRuntime,
-    /// A bundle, with the package of `python/`.
+    /// PyTorch with the package of `python/`, for a bundle.
     PyTorch,
 }
 
 impl Runtime {
-    /// What the script calls it, and what `pip install` takes for it; `./python` is in this project's repository.
-    fn words(self) -> [&'static str; 2] {
+    /// The script's name of the runtime, and the packages for `pip install`; `./python` is in this
+    /// project's repository.
+    fn name_and_packages(self) -> [&'static str; 2] {
         match self {
             Runtime::OnnxRuntime => ["onnx", "numpy onnxruntime"],
             Runtime::PyTorch => ["torch", "./python"],
@@ -45,26 +54,26 @@ impl Runtime {
     }
 }
 
-/// How far a batch lies from this program's.
+/// Deviation of a batch from this program's output.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Deviation {
     /// Images, height and width.
     pub size: [usize; 3],
-    /// Largest difference, as a share of the batch's largest value.
+    /// Largest difference relative to the batch's largest value.
     pub of_largest: f32,
-    /// Largest difference of a value as a share of `sqrt(x^2 + 0.001)`, which is how RelMSE (Eq. 5) weighs it: of the value
-    /// itself, and of 0.03 where it is dark.
+    /// Largest difference relative to `sqrt(x^2 + 0.001)`, the weight in RelMSE (Eq. 5): about the
+    /// value itself, and 0.03 for dark values.
     pub of_value: f32,
 }
 
 impl Deviation {
-    /// Of two batches of this size.
+    /// Compares two batches of this size.
     fn of(size: [usize; 3], found: &[f32], expected: &[f32]) -> Self {
         let largest = expected.iter().fold(0.0f32, |m, x| m.max(x.abs()));
-        let worst = |share: &dyn Fn(f32, f32) -> f32| {
-            let shares = found.iter().zip(expected).map(|(f, e)| share(*f, *e));
-            // NaN agrees with nothing; equal zeros agree.
-            shares.fold(
+        let worst = |relative: &dyn Fn(f32, f32) -> f32| {
+            let differences = found.iter().zip(expected).map(|(f, e)| relative(*f, *e));
+            // NaN never agrees; equal zeros agree.
+            differences.fold(
                 0.0f32,
                 |m, x| if x.is_nan() { f32::INFINITY } else { m.max(x) },
             )
@@ -85,60 +94,61 @@ impl Deviation {
     }
 }
 
-/// What was found.
+/// The result of a verification.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Verification {
-    /// Name and version of what ran the file.
+    /// Name and version of the runtime.
     pub runtime: String,
-    /// One for each of [`SIZES`].
+    /// One deviation per entry of [`SIZES`].
     pub deviations: Vec<Deviation>,
 }
 
-/// Why a file could not be compared.
+/// Why a file cannot be verified.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum VerifyError {
-    /// No such interpreter.
+    /// The interpreter does not start.
     #[error("cannot run {python}; --python or DEMC_PYTHON names another interpreter")]
     Python {
-        /// What was tried.
+        /// The interpreter.
         python: PathBuf,
-        /// Why it failed.
+        /// The operating system's error.
         source: std::io::Error,
     },
-    /// It lacks what runs the file.
-    #[error("{0} cannot import what runs the file ({0} -m pip install {packages}): {detail}", python.display())]
+    /// The interpreter lacks a package.
+    #[error("{0} lacks a package (install with: {0} -m pip install {packages}): {detail}", python.display())]
     Packages {
         /// The interpreter.
         python: PathBuf,
-        /// What `pip install` takes.
+        /// The packages for `pip install`.
         packages: &'static str,
-        /// What it could not import.
+        /// The import error.
         detail: String,
     },
-    /// It does not take the file.
+    /// The runtime cannot run the file.
     #[error("{} in {}: {detail}", file.display(), python.display())]
     Run {
         /// The interpreter.
         python: PathBuf,
         /// The file.
         file: PathBuf,
-        /// The last line that it said.
+        /// The last line of its output.
         detail: String,
     },
-    /// No place for the frames.
-    #[error("a temporary file")]
+    /// A temporary file for the frames fails.
+    #[error("cannot use a temporary file")]
     Temporary(#[from] std::io::Error),
     /// This program cannot denoise a frame.
     #[error(transparent)]
     Denoise(#[from] DenoiseError),
 }
 
-/// Runs `file` in `python` and compares with `expected`, on frames that are the same each time for the same statistics.
+/// Runs `file` with the interpreter `python` and compares with `expected`. Equal statistics give
+/// equal frames.
 ///
 /// # Errors
-/// An interpreter, or a package of it, that is not there; a file that it cannot run. A deviation is none: see
-/// [`Deviation::passes`].
+/// A missing interpreter or package, or a file that the runtime cannot run. A deviation is no
+/// error: see [`Deviation::passes`].
 pub fn verify(
     file: &Path,
     runtime: Runtime,
@@ -152,7 +162,7 @@ pub fn verify(
         let (mut colors, mut features, mut output) = (Vec::new(), Vec::new(), Vec::new());
         for _ in 0..batch {
             let statistics = &expected.meta.normalizer.features;
-            let frame = synthetic::frame([height, width], statistics, &mut rng);
+            let frame = synthetic_frame([height, width], statistics, &mut rng);
             output.extend(expected.denoise(&frame)?);
             colors.extend(frame.color);
             features.extend(frame.features);
@@ -185,9 +195,9 @@ pub fn verify(
     })
 }
 
-/// Lets Python answer the folder's inputs. Returns name and version of the runtime.
+/// Runs the file on the folder's inputs. Returns name and version of the runtime.
 fn run(file: &Path, runtime: Runtime, python: &Path, folder: &Path) -> Result<String, VerifyError> {
-    let [kind, packages] = runtime.words();
+    let [kind, packages] = runtime.name_and_packages();
     let start = |source| VerifyError::Python {
         python: python.into(),
         source,
@@ -202,7 +212,7 @@ fn run(file: &Path, runtime: Runtime, python: &Path, folder: &Path) -> Result<St
         .map_err(start)?;
     let sizes = format!("{SIZES:?}");
     if let Some(mut stdin) = child.stdin.take() {
-        // Where it has ended already, its exit code and last words say why.
+        // If Python has already ended, its exit code and output tell why.
         let _ = stdin.write_all(sizes.as_bytes());
     }
     let Output {
@@ -213,7 +223,7 @@ fn run(file: &Path, runtime: Runtime, python: &Path, folder: &Path) -> Result<St
     let last_line = |bytes: &[u8]| {
         let text = String::from_utf8_lossy(bytes);
         let line = text.lines().rev().find(|line| !line.trim().is_empty());
-        line.unwrap_or("it said nothing").trim().to_string()
+        line.unwrap_or("no output").trim().to_string()
     };
     match status.code() {
         Some(0) => Ok(last_line(&stdout)),
@@ -230,6 +240,53 @@ fn run(file: &Path, runtime: Runtime, python: &Path, folder: &Path) -> Result<St
     }
 }
 
+/// A frame that resembles a rendering at 4 samples per pixel, without a renderer.
+///
+/// Radiance is albedo times noise; 30 % of the pixels are black, and some are fireflies. Features
+/// spread around the training mean as in training, constant in blocks with noise on top.
+fn synthetic_frame(
+    [height, width]: [usize; 2],
+    statistics: &FeatureStats,
+    rng: &mut impl Rng,
+) -> Frame {
+    let pixels = height * width;
+    let objects = width.div_ceil(OBJECT) * height.div_ceil(OBJECT);
+    let object = |pixel: usize| {
+        let (y, x) = (pixel / width / OBJECT, pixel % width / OBJECT);
+        y * width.div_ceil(OBJECT) + x
+    };
+    let mut color = vec![0.0; 3 * pixels];
+    let albedo: Vec<[f32; 3]> = (0..objects).map(|_| rng.random()).collect();
+    for pixel in 0..pixels {
+        let light = match rng.random::<f32>() {
+            share if share < FIREFLIES => 10f32.powf(rng.random_range(FIREFLY_EXPONENTS)),
+            share if share < FIREFLIES + BLACK => 0.0,
+            _ => rng.random_range(0.0..1.5f32).powi(2),
+        };
+        for (channel, albedo) in albedo[object(pixel)].into_iter().enumerate() {
+            color[channel * pixels + pixel] = light * albedo;
+        }
+    }
+    let mut features = Vec::with_capacity(FEATURES * pixels);
+    for (mean, std) in statistics.mean.into_iter().zip(statistics.std) {
+        let flat: Vec<f32> = (0..objects).map(|_| rng.random_range(-1.7..1.7)).collect();
+        features.extend((0..pixels).map(|pixel| {
+            let z = flat[object(pixel)] + rng.random_range(-0.3..0.3f32);
+            mean + std * z
+        }));
+    }
+    Frame {
+        name: "synthetic".into(),
+        width,
+        height,
+        color,
+        features,
+        reference: None,
+        mask: None,
+        clamped: 0,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -237,7 +294,7 @@ mod tests {
     use demc_model::Variant;
 
     #[test]
-    fn deviations_are_of_the_largest_and_of_each_value() {
+    fn deviations_are_relative_to_the_largest_and_to_each_value() {
         let size = [1, 1, 1];
         let deviation = Deviation::of(size, &[10.0, 0.01, 0.0], &[10.0, 0.0, 0.0]);
         assert!((deviation.of_largest - 1e-3).abs() < 1e-9);
@@ -251,11 +308,11 @@ mod tests {
     }
 
     #[test]
-    fn a_synthetic_frame_is_one_that_a_model_takes() {
+    fn a_synthetic_frame_resembles_the_training_data() {
         let bundle = bundle(Variant::Demc);
         let statistics = &bundle.meta.normalizer.features;
         let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let frame = synthetic::frame([64, 96], statistics, &mut rng);
+        let frame = synthetic_frame([64, 96], statistics, &mut rng);
         assert!(bundle.check_statistics(&frame).is_ok());
         assert_eq!(frame.color.len(), 3 * 64 * 96);
         assert!(frame.color.iter().any(|x| *x > 10.0), "no firefly");
@@ -269,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn an_interpreter_that_is_not_there_is_named() {
+    fn a_missing_interpreter_is_named() {
         let nowhere = Path::new("/nowhere/python3");
         let bundle = bundle(Variant::ColorOnly);
         let found = verify(Path::new("x"), Runtime::OnnxRuntime, nowhere, &bundle);

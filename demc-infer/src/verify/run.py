@@ -1,13 +1,13 @@
-"""Runs an exported file on the images of a folder: `KIND FILE FOLDER`, shapes as JSON from stdin.
+"""Runs an exported file on the batches of a folder. Arguments: KIND FILE FOLDER; shapes as JSON on stdin.
 
-Image i is `i.color` and `i.features`, raw float32; the answer is `i.output`. Exit code 3: a package is missing.
+Batch i is `i.color` and `i.features` as raw float32; the result is `i.output`. Exit code 3: a package is missing.
 """
 
 import json
 import sys
 from pathlib import Path
 
-# With `-c` the first entry is the working directory: no module of the user's shall be taken for a package.
+# With `-c`, the first entry is the working directory, where a user's file could shadow a package.
 sys.path = [entry for entry in sys.path if entry]
 
 

@@ -1,4 +1,4 @@
-//! What the command line tests share: a tiny random model, the sample data, and the real binary.
+//! Shared by the command line tests: a tiny random model, the sample data, and the binary.
 #![allow(dead_code, reason = "each test file uses its part")]
 
 use std::ffi::{OsStr, OsString};
@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use tempfile::TempDir;
 
-/// A directory with `best.safetensors`, as a run leaves it: a random network of base width 2.
+/// A run directory: `best.safetensors` with a random network of base width 2.
 pub fn run_directory() -> TempDir {
     let directory = tempfile::tempdir().expect("directory");
     let path = directory.path().join("best.safetensors");
@@ -33,7 +33,7 @@ pub fn random_bundle() -> Bundle {
     };
     let normalizer = Normalizer {
         gamma: 2.2,
-        demodulate: 0.0,
+        albedo_demodulation_epsilon: None,
         features: FeatureStats {
             mean: [0.2; 12],
             std: [0.7; 12],
@@ -58,7 +58,7 @@ pub fn sample_image(name: &str) -> PathBuf {
     sample().join("test").join(name)
 }
 
-/// What a run of `demc-infer` gave.
+/// The outcome of a run of `demc-infer`.
 pub struct Outcome {
     pub code: i32,
     pub stdout: String,
@@ -82,7 +82,7 @@ pub fn demc_infer<A: AsRef<OsStr>>(arguments: impl IntoIterator<Item = A>) -> Ou
     }
 }
 
-/// Arguments of different types as one list.
+/// A list of arguments of different types.
 #[macro_export]
 macro_rules! arguments {
     ($($argument:expr),* $(,)?) => {
@@ -90,7 +90,7 @@ macro_rules! arguments {
     };
 }
 
-/// `demc-infer export` of a model to a file.
+/// Runs `demc-infer export` for a model and a file.
 pub fn export(model: &Path, file: &Path, flags: &[&str]) -> Outcome {
     let list = arguments!["export", "--model", model, "-o", file];
     demc_infer(list.into_iter().chain(flags.iter().map(OsString::from)))
@@ -103,7 +103,8 @@ impl Outcome {
         self
     }
 
-    /// Fails the test unless the run ended with `code` and stderr is one line: `error: ` and `start`...
+    /// Fails the test unless the exit code is `code` and stderr is one line that starts with
+    /// `error: ` and `start`.
     pub fn failure(self, code: i32, start: &str) -> Self {
         assert_eq!(self.code, code, "{}", self.stderr);
         assert_eq!(self.stderr.lines().count(), 1, "{}", self.stderr);

@@ -1,34 +1,40 @@
 //! Batch normalisation (Ioffe and Szegedy 2015) with the ReLU after it.
 //!
-//! Channels come last, so a per-channel parameter is repeated to the length of a *row* of pixels: passes are then plain
-//! loops over rows, which the compiler vectorises whatever the channels. Sums are taken along the columns of such rows
-//! in float32 over a *block* of fixed size, and over its blocks in float64, in order.
+//! Channels come last, so a per-channel parameter is repeated to the length of a *row* of pixels.
+//! Passes are then plain loops over rows, which the compiler vectorises for any number of channels.
+//! Sums run along the columns of such rows, in float32 within a *block* of fixed size. Blocks are
+//! added in float64, in order.
 //!
 //! NaN and infinite values reach the output: ReLU lets NaN through.
 
 mod passes;
 
-use passes::{GradientSums, InputGradient, Moments, Normalize};
+use passes::{BlockMoments, GradientSums, InputGradient, Normalize};
 
 use crate::Isa;
 use crate::simd;
 use crate::tasks::{self, TASK};
 
-/// Least values of a row.
+/// Minimum number of values in a row.
 const ROW: usize = 512;
 
-/// Values of a block, about: 128 KiB, which a core's own cache holds for a second look.
+/// Approximate number of values in a block: 128 KiB, which stays in a core's own cache for the
+/// second pass.
 const BLOCK: usize = 2 * TASK;
 
-/// Normalises by the batch's own statistics: `y = (x - mean) / sqrt(variance + epsilon) * gamma + beta`, rectified where
-/// asked, and returns them: the mean and the biased variance over all pixels, by channel.
+/// Normalises by the statistics of the batch: `y = (x - mean) / sqrt(variance + epsilon) * gamma +
+/// beta`, rectified if `relu`. Writes the mean and the biased variance of each channel over all
+/// pixels.
 ///
 /// # Shapes
 /// `x` and `y`: `[pixels, channels]`; the others `[channels]`.
 ///
 /// # Panics
-/// Where the lengths do not fit, or for maps without a pixel.
-#[allow(clippy::too_many_arguments, reason = "what the operation is")]
+/// If a length does not match the others, or a map has no pixels.
+#[allow(
+    clippy::too_many_arguments,
+    reason = "the operands of a batch normalisation"
+)]
 pub fn forward_train(
     isa: Isa,
     x: &[f32],
@@ -49,14 +55,18 @@ pub fn forward_train(
     forward_eval(isa, x, gamma, beta, mean, variance, epsilon, relu, y);
 }
 
-/// Normalises by given statistics: `y = (x - mean) / sqrt(variance + epsilon) * gamma + beta`, rectified where asked.
+/// Normalises by given statistics: `y = (x - mean) / sqrt(variance + epsilon) * gamma + beta`,
+/// rectified if `relu`.
 ///
 /// # Shapes
 /// `x` and `y`: `[pixels, channels]`; the others `[channels]`.
 ///
 /// # Panics
-/// Where the lengths do not fit, or for maps without a pixel.
-#[allow(clippy::too_many_arguments, reason = "what the operation is")]
+/// If a length does not match the others, or a map has no pixels.
+#[allow(
+    clippy::too_many_arguments,
+    reason = "the operands of a batch normalisation"
+)]
 pub fn forward_eval(
     isa: Isa,
     x: &[f32],
@@ -85,20 +95,24 @@ pub fn forward_eval(
             relu,
             y,
         };
-        // SAFETY: the leaf has slices only.
+        // SAFETY: the leaf accesses memory through slices only.
         unsafe { simd::run(tasks::streaming(isa), leaf) }
     });
 }
 
-/// Gradients of [`forward_train`] with the statistics that it returned, which depend on `x` themselves. Where the output
-/// was rectified, `y` is that output: `dy` then counts only where `y` is positive. All three gradients are overwritten.
+/// Gradients of [`forward_train`], including the dependence of its statistics on `x`. If the output
+/// was rectified, `y` is that output, and `dy` counts only where `y` is positive. All three
+/// gradients are overwritten.
 ///
 /// # Shapes
 /// `x`, `y`, `dy` and `dx`: `[pixels, channels]`; the others `[channels]`.
 ///
 /// # Panics
-/// Where the lengths do not fit, or for maps without a pixel.
-#[allow(clippy::too_many_arguments, reason = "what the operation is")]
+/// If a length does not match the others, or a map has no pixels.
+#[allow(
+    clippy::too_many_arguments,
+    reason = "the operands of a batch normalisation"
+)]
 pub fn backward(
     isa: Isa,
     x: &[f32],
@@ -125,7 +139,7 @@ pub fn backward(
         "y, dy and dx beside a map of {} values",
         x.len()
     );
-    // Without a ReLU any map does as `y`.
+    // Without a ReLU the value of `y` does not matter.
     let (gated, y) = (y.is_some(), y.unwrap_or(dy));
 
     let rows = Rows::new(x.len(), channels);
@@ -144,12 +158,15 @@ pub fn backward(
             mean: means,
             channels,
         };
-        // SAFETY: the leaf has slices only.
+        // SAFETY: the leaf accesses memory through slices only.
         unsafe { simd::run(tasks::streaming(isa), leaf) }
     });
 
-    // With g = dy behind the gate, n pixels and s = 1 / sqrt(variance + epsilon):
-    //   dbeta = sum g, dgamma = s sum g (x - mean), dx = gamma s (g - dbeta / n - (x - mean) s dgamma / n).
+    // Let g be dy behind the gate, n the pixels, and s = 1 / sqrt(variance + epsilon).
+    //
+    // dbeta = sum g, dgamma = s sum g (x - mean).
+    //
+    // dx = gamma s (g - dbeta / n - (x - mean) s dgamma / n).
     let pixels = (x.len() / channels) as f64;
     let scale = scales(gamma, variance, epsilon);
     let (mut slope, mut shift) = (vec![0.0; channels], vec![0.0; channels]);
@@ -179,7 +196,7 @@ pub fn backward(
                 shift,
                 dx,
             };
-            // SAFETY: the leaf has slices only.
+            // SAFETY: the leaf accesses memory through slices only.
             unsafe { simd::run(tasks::streaming(isa), leaf) }
         },
     );
@@ -210,7 +227,7 @@ fn scales(gamma: &[f32], variance: &[f32], epsilon: f32) -> Vec<f32> {
     gamma.iter().zip(variance).map(scale).collect()
 }
 
-/// How a map is cut.
+/// How a map is divided into rows and blocks.
 #[derive(Clone, Copy)]
 struct Rows {
     /// Values of a row: whole pixels.
@@ -222,14 +239,14 @@ struct Rows {
 impl Rows {
     fn new(len: usize, channels: usize) -> Self {
         let pixels = ROW.div_ceil(channels);
-        // Short pixels that fill no vectors do so 16 at a time.
+        // Pixels too short to fill vectors are processed 16 at a time.
         let odd = channels < ROW / 4 && !channels.is_multiple_of(16);
         let pixels = if odd {
             pixels.next_multiple_of(16)
         } else {
             pixels
         };
-        // One row is enough for a map that is shorter.
+        // A map shorter than that is one row.
         let width = (channels * pixels).min(len);
         Rows {
             width,
@@ -237,7 +254,7 @@ impl Rows {
         }
     }
 
-    /// A parameter by channel, for each value of a row.
+    /// A per-channel parameter, repeated for each value of a row.
     fn repeated(self, parameter: &[f32]) -> Vec<f32> {
         parameter.iter().copied().cycle().take(self.width).collect()
     }
@@ -248,11 +265,11 @@ fn statistics(isa: Isa, x: &[f32], mean: &mut [f32], variance: &mut [f32]) {
     let channels = mean.len();
     let rows = Rows::new(x.len(), channels);
     let blocks = tasks::map(x.chunks(rows.block), |x| {
-        // SAFETY: the leaf has slices only.
+        // SAFETY: the leaf accesses memory through slices only.
         unsafe {
             simd::run(
                 tasks::streaming(isa),
-                Moments {
+                BlockMoments {
                     x,
                     width: rows.width,
                     channels,
@@ -260,7 +277,7 @@ fn statistics(isa: Isa, x: &[f32], mean: &mut [f32], variance: &mut [f32]) {
             )
         }
     });
-    // Combined as by Chan, Golub and LeVeque (1983): no difference of large sums.
+    // Combined as in Chan, Golub and LeVeque (1983), without differences of large sums.
     let pixels = (x.len() / channels) as f64;
     let counts = || x.chunks(rows.block).map(|x| (x.len() / channels) as f64);
     for c in 0..channels {

@@ -1,9 +1,9 @@
-//! The passes of [`super`] over some rows of a map, each on one thread: plain loops, which the compiler vectorises for the
-//! path. Nothing is fused or reordered, so each path gives the same bits.
+//! The passes of [`super`] over some rows of a map, each on one thread. They are plain loops that
+//! the compiler vectorises. Nothing is fused or reordered, so every path gives the same bits.
 
 use crate::simd::{Leaf, Simd};
 
-/// The sums of the columns of a row by channel.
+/// Sums the columns of a row by channel.
 #[inline(always)]
 fn by_channel(columns: &[f32], channels: usize) -> Vec<f64> {
     let mut sums = vec![0.0; channels];
@@ -16,16 +16,17 @@ fn by_channel(columns: &[f32], channels: usize) -> Vec<f64> {
 }
 
 /// Mean of each channel of a block, and the sum of squared distances from it.
-pub(super) struct Moments<'a> {
+pub(super) struct BlockMoments<'a> {
     pub(super) x: &'a [f32],
     pub(super) width: usize,
     pub(super) channels: usize,
 }
 
-impl Leaf for Moments<'_> {
+impl Leaf for BlockMoments<'_> {
     type Out = Vec<[f64; 2]>;
 
-    /// Twice over a block that the cache holds: a mean, then the distances from it, whose sum corrects it.
+    /// Two passes over a block that the cache holds: first a mean, then the distances from it,
+    /// whose sum corrects it.
     #[inline(always)]
     unsafe fn run<S: Simd>(self) -> Vec<[f64; 2]> {
         let pixels = (self.x.len() / self.channels) as f64;
@@ -59,7 +60,7 @@ impl Leaf for Moments<'_> {
         moments
             .map(|((sum, square), near)| {
                 let square = square - sum * sum / pixels;
-                // Rounding may leave a little below 0; NaN stays.
+                // Rounding may give a value slightly below 0. NaN stays.
                 let square = if square < 0.0 { 0.0 } else { square };
                 [f64::from(near) + sum / pixels, square]
             })
@@ -102,13 +103,13 @@ impl Leaf for Normalize<'_> {
     }
 }
 
-/// `dy` behind the gate of a ReLU whose output is `y`.
+/// `dy` behind the gate of a ReLU with output `y`.
 #[inline(always)]
 fn gate(dy: f32, y: f32) -> f32 {
     if y > 0.0 { dy } else { 0.0 }
 }
 
-/// Sums of a block by channel: of `g`, and of `g (x - mean)`.
+/// Sums over a block by channel, of `g` and of `g (x - mean)`.
 pub(super) struct GradientSums<'a> {
     pub(super) x: &'a [f32],
     pub(super) y: &'a [f32],

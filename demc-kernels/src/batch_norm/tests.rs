@@ -1,11 +1,12 @@
-//! Against plain float64 loops; what is large, constant or no number.
+//! Compares with plain float64 loops, for large, constant and non-finite values.
 
 use super::*;
 use crate::testing::{assert_within, bits, pattern, same_on_any_number_of_threads};
 
 const EPSILON: f32 = 1e-3;
 
-/// Pixels and channels: one value, vectors left unfilled, several blocks, a block with a part of a row.
+/// Pixels and channels: a single value, partly filled vectors, several blocks, a block with part of
+/// a row.
 fn sizes() -> Vec<(usize, usize)> {
     let all = [
         (1, 1),
@@ -30,7 +31,7 @@ struct Case {
     dy: Vec<f32>,
 }
 
-/// Channels of different means, spreads and weights.
+/// Channels with different means, spreads and weights.
 fn case(pixels: usize, channels: usize) -> Case {
     let by_channel = |seed| pattern(channels, seed);
     let (center, spread) = (by_channel(1), by_channel(2));
@@ -47,7 +48,7 @@ fn case(pixels: usize, channels: usize) -> Case {
     }
 }
 
-struct Found {
+struct KernelResult {
     y: Vec<f32>,
     mean: Vec<f32>,
     variance: Vec<f32>,
@@ -56,7 +57,7 @@ struct Found {
     dbeta: Vec<f32>,
 }
 
-fn found(isa: Isa, case: &Case, relu: bool) -> Found {
+fn found(isa: Isa, case: &Case, relu: bool) -> KernelResult {
     let (len, channels) = (case.x.len(), case.gamma.len());
     let map = || vec![f32::NAN; len];
     let row = || vec![f32::NAN; channels];
@@ -87,7 +88,7 @@ fn found(isa: Isa, case: &Case, relu: bool) -> Found {
         &mut dgamma,
         &mut dbeta,
     );
-    Found {
+    KernelResult {
         y,
         mean,
         variance,
@@ -97,7 +98,8 @@ fn found(isa: Isa, case: &Case, relu: bool) -> Found {
     }
 }
 
-/// Compares with plain loops in float64. Gates are those of the float32 output, which a value near 0 may flip.
+/// Compares with plain loops in float64. Gates come from the float32 output, which may flip for a
+/// value near 0.
 fn check_case(isa: Isa, case: &Case, relu: bool, what: &str) {
     let channels = case.gamma.len();
     let found = found(isa, case, relu);
@@ -128,7 +130,8 @@ fn check_case(isa: Isa, case: &Case, relu: bool, what: &str) {
             dx[i] = gamma * s * (g(i) - dbeta[c] / n - hat(i) * dgamma[c] / n);
         }
     }
-    // Means to a rounding of values up to 5; s is up to 32, where one pixel has no spread.
+    // Means are exact to one rounding of values up to 5. The factor s reaches 32 where one pixel
+    // has no spread.
     assert_within(&format!("mean, {what}"), &found.mean, &means, 2e-7);
     assert_within(
         &format!("variance, {what}"),
@@ -137,7 +140,7 @@ fn check_case(isa: Isa, case: &Case, relu: bool, what: &str) {
         2e-7,
     );
     assert_within(&format!("y, {what}"), &found.y, &y, 5e-6);
-    // Sums of up to 5000 terms of order 1, of which float32 adds some tens to a few hundred.
+    // Sums of up to 5000 terms of order 1; float32 adds up to a few hundred of them.
     assert_within(&format!("dbeta, {what}"), &found.dbeta, &dbeta, 1e-5);
     assert_within(&format!("dgamma, {what}"), &found.dgamma, &dgamma, 1e-5);
     assert_within(&format!("dx, {what}"), &found.dx, &dx, 1e-5);
@@ -160,7 +163,7 @@ fn forward_and_backward_are_those_of_plain_loops() {
     }
 }
 
-/// A mean of a thousand deviations, drifting over the map, and a first pixel far off.
+/// A mean of a thousand deviations that drifts over the map, and an outlier as the first pixel.
 #[test]
 fn variance_beside_a_large_mean_is_exact() {
     let pixels = if cfg!(miri) { 600 } else { 40_000 };
@@ -205,9 +208,9 @@ fn a_constant_map_becomes_beta() {
     }
 }
 
-/// No fused operations: the same everywhere.
+/// No operation is fused, so the bits are the same everywhere.
 #[test]
-#[cfg_attr(miri, ignore = "minutes long")]
+#[cfg_attr(miri, ignore = "takes minutes")]
 fn bits_depend_neither_on_the_path_nor_on_the_threads() {
     let case = case(3000, 17);
     let work = |isa| {
@@ -221,7 +224,7 @@ fn bits_depend_neither_on_the_path_nor_on_the_threads() {
 }
 
 #[test]
-fn what_is_no_number_reaches_the_output_through_the_relu() {
+fn non_finite_values_pass_through_the_relu() {
     for isa in Isa::available() {
         let mut case = case(40, 3);
         case.x[10] = f32::NAN;

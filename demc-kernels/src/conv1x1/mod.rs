@@ -1,19 +1,21 @@
-//! The 1x1 convolution of one or several maps side by side: their concatenation is never made (Eq. 2).
+//! The 1x1 convolution over one or several maps side by side, without building their concatenation
+//! (Eq. 2).
 
 use rayon::prelude::*;
 
 use crate::product::padded_rows;
-use crate::rows::{self, BLOCK, Copy, Outer, Packed, Term, Window, copy, whole};
+use crate::rows::{self, BLOCK, Copy, Outer, Packed, PaddedRows, Term, copy, whole};
 use crate::scratch::Scratch;
 use crate::{Grid, Isa};
 
-/// `y = [xs] * weight + bias`, rectified where `relu`.
+/// `y = [xs] * weight + bias`, rectified if `relu`.
 ///
 /// # Shapes
-/// `xs` `[B, H, W, in_i]` each, `weight` `[out, in]` with `in` the sum of all, `bias` `[out]`, `y` `[B, H, W, out]`.
+/// `xs` `[B, H, W, in_i]` each, `weight` `[out, in]` with `in` the sum of all, `bias` `[out]`, `y`
+/// `[B, H, W, out]`.
 ///
 /// # Panics
-/// Where the lengths do not fit.
+/// If a length does not match the others.
 pub fn forward(
     isa: Isa,
     grid: Grid,
@@ -39,7 +41,7 @@ pub fn forward(
         xs,
         &inputs,
         &weights,
-        Finish {
+        Epilogue {
             bias: Some(bias),
             relu,
             add: false,
@@ -48,35 +50,36 @@ pub fn forward(
     );
 }
 
-/// What becomes of the sum of [`part`].
+/// Operations on the sum of [`part`].
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Finish<'a> {
+pub struct Epilogue<'a> {
     /// Added to each channel.
     pub bias: Option<&'a [f32]>,
-    /// Whether the result is rectified.
+    /// Apply ReLU to the result.
     pub relu: bool,
-    /// Whether what `y` holds is added to the sum before that.
+    /// Add the previous content of `y` before bias and ReLU.
     pub add: bool,
 }
 
-/// A part of a 1x1 convolution, for inference: `y = finish([xs] * W + y)`, W the inputs of `weight` from `first` on.
+/// A part of a 1x1 convolution, for inference: `y = epilogue([xs] * W + y)`. W holds the inputs of
+/// `weight` from `first` on.
 ///
-/// The convolution is linear until its ReLU, so its inputs can be added one by one as they come, and need not be there at
-/// the same time.
+/// The convolution is linear up to its ReLU, so its inputs can be added one by one and need not be
+/// in memory together.
 ///
 /// # Shapes
-/// `xs` `[B, H, W, in_i]` each, `weight` `[out, in]` with `first` and the sum of all `in_i` at most `in`, `y`
-/// `[B, H, W, out]`.
+/// `xs` `[B, H, W, in_i]` each, `weight` `[out, in]` with `first` and the sum of all `in_i` at most
+/// `in`, `y` `[B, H, W, out]`.
 ///
 /// # Panics
-/// Where the lengths do not fit.
+/// If a length does not match the others.
 pub fn part(
     isa: Isa,
     grid: Grid,
     xs: &[&[f32]],
     weight: &[f32],
     first: usize,
-    finish: Finish,
+    epilogue: Epilogue,
     y: &mut [f32],
 ) {
     let outputs = grid.channels(y.len());
@@ -88,27 +91,27 @@ pub fn part(
         "inputs {first} to {end} of {total}"
     );
     assert!(
-        finish.bias.is_none_or(|bias| bias.len() == outputs),
+        epilogue.bias.is_none_or(|bias| bias.len() == outputs),
         "a bias of {outputs} channels"
     );
     let weights: Vec<Packed> = inputs
         .iter()
-        .map(|&(at, count)| {
+        .map(|&(offset, count)| {
             Packed::new(isa, count, outputs, |k, o| {
-                weight[o * total + first + at + k]
+                weight[o * total + first + offset + k]
             })
         })
         .collect();
-    products(isa, xs, &inputs, &weights, finish, y);
+    products(isa, xs, &inputs, &weights, epilogue, y);
 }
 
-/// The sum of the products of all maps with their weights, finished.
+/// Sums the products of all maps with their weights and applies the epilogue.
 fn products(
     isa: Isa,
     xs: &[&[f32]],
     inputs: &[(usize, usize)],
     weights: &[Packed],
-    finish: Finish,
+    epilogue: Epilogue,
     y: &mut [f32],
 ) {
     let outputs = weights[0].columns();
@@ -117,10 +120,10 @@ fn products(
         .enumerate()
         .for_each(|(task, y)| {
             let (first, count) = (task * BLOCK, y.len() / outputs);
-            let windows: Vec<Window> = xs
+            let windows: Vec<PaddedRows> = xs
                 .iter()
                 .zip(inputs)
-                .map(|(x, (_, step))| Window::new(x, *step, first, count))
+                .map(|(x, (_, step))| PaddedRows::new(x, *step, first, count))
                 .collect();
             let terms: Vec<Term> = windows
                 .iter()
@@ -133,7 +136,7 @@ fn products(
                 })
                 .collect();
             let mut c = Scratch::take(padded_rows(count) * wide);
-            if finish.add {
+            if epilogue.add {
                 copy(
                     isa,
                     Copy {
@@ -142,8 +145,8 @@ fn products(
                         gate: None,
                         bias: None,
                         relu: false,
-                        to: &mut c,
-                        to_step: wide,
+                        target: &mut c,
+                        target_step: wide,
                         rows: count,
                         channels: outputs,
                     },
@@ -158,10 +161,10 @@ fn products(
                     from: &c,
                     from_step: wide,
                     gate: None,
-                    bias: finish.bias,
-                    relu: finish.relu,
-                    to: y,
-                    to_step: outputs,
+                    bias: epilogue.bias,
+                    relu: epilogue.relu,
+                    target: y,
+                    target_step: outputs,
                     rows: count,
                     channels: outputs,
                 },
@@ -169,17 +172,17 @@ fn products(
         });
 }
 
-/// Gradients of [`forward`] for `dy`, the gradient by `y`: those of `xs` where asked for, `dweight`, `dbias`, all
-/// overwritten.
+/// Gradients of [`forward`]. `dy` is the gradient with respect to `y`. Writes the requested
+/// gradients of `xs`, `dweight` and `dbias`.
 ///
-/// `y` is the output where it was rectified: `dy` then counts where `y` is positive.
+/// If the output was rectified, `y` is that output, and `dy` counts only where `y` is positive.
 ///
 /// # Shapes
 /// As in [`forward`]; a gradient has the shape of its value.
 ///
 /// # Panics
-/// Where the lengths do not fit.
-#[allow(clippy::too_many_arguments, reason = "what a convolution is made of")]
+/// If a length does not match the others.
+#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
 pub fn backward(
     isa: Isa,
     grid: Grid,
@@ -208,7 +211,7 @@ pub fn backward(
     );
     let wide = whole(outputs);
 
-    // The gated gradient with whole vectors in its rows, and its sums over blocks.
+    // The gated gradient with rows padded to whole vectors, and its sums over blocks.
     let mut gated = Scratch::take(pixels * wide);
     let mut biases = vec![0.0f64; pixels.div_ceil(BLOCK) * outputs];
     gated
@@ -225,8 +228,8 @@ pub fn backward(
                     gate: y.map(|y| &y[first..]),
                     bias: None,
                     relu: false,
-                    to: gated,
-                    to_step: wide,
+                    target: gated,
+                    target_step: wide,
                     rows: count,
                     channels: outputs,
                 },
@@ -245,7 +248,7 @@ pub fn backward(
             .enumerate()
             .for_each(|(task, dx)| {
                 let rows = dx.len() / count;
-                let window = Window::new(&gated, wide, task * BLOCK, rows);
+                let window = PaddedRows::new(&gated, wide, task * BLOCK, rows);
                 let c_step = whole(count);
                 let mut c = Scratch::take(padded_rows(rows) * c_step);
                 let term = Term {
@@ -262,8 +265,8 @@ pub fn backward(
                         gate: None,
                         bias: None,
                         relu: false,
-                        to: dx,
-                        to_step: count,
+                        target: dx,
+                        target_step: count,
                         rows,
                         channels: count,
                     },
@@ -272,7 +275,8 @@ pub fn backward(
     }
 
     for (x, &(first, count)) in xs.iter().zip(&inputs) {
-        // Blocks of rows read past the last pixels: those apart, from a copy.
+        // Blocks of rows read past the last pixels, so those pixels are processed from a padded
+        // copy.
         let outer = |a, b, pixels| Outer {
             a,
             a_step: count,
@@ -287,14 +291,14 @@ pub fn backward(
             let tail = 24_usize.div_ceil(count) + 1;
             let body = pixels - tail;
             products.push(rows::outer(isa, &[outer(x, &gated, body)], wide));
-            let end = Window::new(x, count, body, tail);
+            let end = PaddedRows::new(x, count, body, tail);
             products.push(rows::outer(
                 isa,
                 &[outer(end.rows(), &gated[body * wide..], tail)],
                 wide,
             ));
         } else {
-            let all = Window::new(x, count, 0, pixels);
+            let all = PaddedRows::new(x, count, 0, pixels);
             products.push(rows::outer(isa, &[outer(all.rows(), &gated, pixels)], wide));
         }
         dweight
@@ -308,7 +312,7 @@ pub fn backward(
     }
 }
 
-/// First input channel and number of channels of each map.
+/// First input channel and channel count of each map.
 fn widths(grid: Grid, xs: &[&[f32]]) -> Vec<(usize, usize)> {
     let mut first = 0;
     xs.iter()
@@ -320,7 +324,7 @@ fn widths(grid: Grid, xs: &[&[f32]]) -> Vec<(usize, usize)> {
         .collect()
 }
 
-/// The same, once all lengths are known to fit.
+/// As [`widths`], after checking all lengths.
 fn check(
     grid: Grid,
     xs: &[&[f32]],

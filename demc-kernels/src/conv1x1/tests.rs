@@ -1,4 +1,4 @@
-//! Against plain float64 loops over concatenated maps.
+//! Compares with plain float64 loops over concatenated maps.
 
 use super::*;
 use crate::reference;
@@ -29,8 +29,16 @@ fn parts_added_one_by_one_are_the_whole() {
             let xs: Vec<&[f32]> = maps.iter().map(|x| &x[..]).collect();
             let (weight, bias) = (pattern(outputs * 39, 7), pattern(outputs, 8));
             let mut y = vec![f32::NAN; grid.pixels() * outputs];
-            part(isa, grid, &xs[1..], &weight, 20, Finish::default(), &mut y);
-            let last = Finish {
+            part(
+                isa,
+                grid,
+                &xs[1..],
+                &weight,
+                20,
+                Epilogue::default(),
+                &mut y,
+            );
+            let last = Epilogue {
                 bias: Some(&bias),
                 relu: true,
                 add: true,

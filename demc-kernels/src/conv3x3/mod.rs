@@ -1,6 +1,6 @@
 //! The 3x3 convolution with padding 1: bias and ReLU fused, and its gradients.
 //!
-//! Wide layers go through `winograd`, those with few channels on one side through `thin`.
+//! Wide layers use `winograd`; layers with few channels on one side use `thin`.
 
 mod parts;
 #[cfg(test)]
@@ -9,18 +9,19 @@ mod thin;
 mod winograd;
 
 use crate::{Grid, Isa};
-use parts::{Axes, Finish};
+use parts::{Axes, BiasRelu};
 
 /// Tiles of the Winograd transforms.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Tile {
-    /// F(2x2, 3x3): 2.25 times fewer multiplications, as exact as the plain sum. For training.
+    /// F(2x2, 3x3): 2.25 times fewer multiplications, as exact as the plain sum. Used for training.
     F2,
-    /// F(4x4, 3x3): 4 times fewer, within 2e-5 of the largest value. For inference.
+    /// F(4x4, 3x3): 4 times fewer multiplications, within 2e-5 of the largest value. Used for
+    /// inference.
     F4,
 }
 
-/// Channels from which on Winograd's transforms pay.
+/// Minimum number of channels for which the Winograd transforms pay off.
 const WINOGRAD_CHANNELS: usize = 8;
 
 /// Input side of a Winograd tile in training: F(2x2, 3x3), as exact as the plain sum.
@@ -30,14 +31,14 @@ fn is_wide(inputs: usize, outputs: usize) -> bool {
     inputs.min(outputs) >= WINOGRAD_CHANNELS
 }
 
-/// `y = x * weight + bias`, rectified where `relu`.
+/// `y = x * weight + bias`, rectified if `relu`.
 ///
 /// # Shapes
 /// `x` `[B, H, W, in]`, `weight` `[out, in, 3, 3]`, `bias` `[out]`, `y` `[B, H, W, out]`.
 ///
 /// # Panics
-/// Where the lengths do not fit.
-#[allow(clippy::too_many_arguments, reason = "what a convolution is made of")]
+/// If a length does not match the others.
+#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
 pub fn forward(
     isa: Isa,
     grid: Grid,
@@ -50,11 +51,11 @@ pub fn forward(
     forward_with(isa, Tile::F2, grid, x, weight, bias, relu, y);
 }
 
-/// [`forward`] with tiles of a given size.
+/// [`forward`] with a given tile size.
 ///
 /// # Panics
-/// Where the lengths do not fit.
-#[allow(clippy::too_many_arguments, reason = "what a convolution is made of")]
+/// If a length does not match the others.
+#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
 pub fn forward_with(
     isa: Isa,
     tile: Tile,
@@ -66,30 +67,30 @@ pub fn forward_with(
     y: &mut [f32],
 ) {
     check(grid, x.len(), weight.len(), bias.len(), y.len());
-    Ready::new(isa, tile, weight, bias, relu).forward(grid, x, 0, y);
+    PreparedConvolution::new(isa, tile, weight, bias, relu).forward(grid, x, 0, y);
 }
 
 /// A convolution whose weights are prepared once, for maps that come in bands of rows.
-pub struct Ready<'a> {
+pub struct PreparedConvolution<'a> {
     isa: Isa,
-    weights: Weights<'a>,
-    finish: Finish<'a>,
+    weights: PreparedWeights<'a>,
+    epilogue: BiasRelu<'a>,
     inputs: usize,
     outputs: usize,
 }
 
-/// As the kernel of their channels takes them.
-enum Weights<'a> {
+/// Weights in the form that the kernel for their channels reads.
+enum PreparedWeights<'a> {
     Thin(&'a [f32]),
-    F2(winograd::Weights),
-    F4(winograd::Weights),
+    F2(winograd::WinogradWeights),
+    F4(winograd::WinogradWeights),
 }
 
-impl<'a> Ready<'a> {
-    /// Of `weight` `[out, in, 3, 3]` and `bias` `[out]`, rectified where `relu`.
+impl<'a> PreparedConvolution<'a> {
+    /// Prepares `weight` `[out, in, 3, 3]` and `bias` `[out]`; the output is rectified if `relu`.
     ///
     /// # Panics
-    /// Where the lengths do not fit.
+    /// If a length does not match the others.
     pub fn new(isa: Isa, tile: Tile, weight: &'a [f32], bias: &'a [f32], relu: bool) -> Self {
         let outputs = bias.len();
         let inputs = weight.len() / (9 * outputs);
@@ -99,22 +100,22 @@ impl<'a> Ready<'a> {
             "a weight of {inputs} to {outputs} channels"
         );
         let weights = match tile {
-            _ if !is_wide(inputs, outputs) => Weights::Thin(weight),
-            Tile::F2 => Weights::F2(winograd::Weights::new::<4>(
+            _ if !is_wide(inputs, outputs) => PreparedWeights::Thin(weight),
+            Tile::F2 => PreparedWeights::F2(winograd::WinogradWeights::new::<4>(
                 isa, weight, outputs, inputs, false,
             )),
-            Tile::F4 => Weights::F4(winograd::Weights::new::<6>(
+            Tile::F4 => PreparedWeights::F4(winograd::WinogradWeights::new::<6>(
                 isa, weight, outputs, inputs, false,
             )),
         };
-        let finish = Finish {
+        let epilogue = BiasRelu {
             bias: Some(bias),
             relu,
         };
-        Ready {
+        PreparedConvolution {
             isa,
             weights,
-            finish,
+            epilogue,
             inputs,
             outputs,
         }
@@ -130,15 +131,18 @@ impl<'a> Ready<'a> {
         self.outputs
     }
 
-    /// Convolves the rows of `x` from `above` on, as many as `y` has. Beyond the rows of `x` are zeros: where an image
-    /// goes on there, `x` holds a row more than `y` on that side. The same bits as of a whole image where a band begins at
-    /// a multiple of 4 rows and has one, or ends with the image.
+    /// Convolves the rows of `x` from `above` on, as many as `y` has. Outside `x` the input is
+    /// zero. Where the image continues, `x` must hold one more row than `y` on that side.
+    ///
+    /// The bits equal those of a whole image for a band that starts at a multiple of 4 rows. Its
+    /// height must also be a multiple of 4, unless it ends with the image.
     ///
     /// # Shapes
-    /// `x` `[B, H, W, in]` with its `grid`, `y` `[B, rows, W, out]`; several images only where `y` has all rows.
+    /// `x` `[B, H, W, in]` with its `grid`, `y` `[B, rows, W, out]`; several images only where `y`
+    /// has all rows.
     ///
     /// # Panics
-    /// Where the lengths do not fit.
+    /// If a length does not match the others.
     pub fn forward(&self, grid: Grid, x: &[f32], above: usize, y: &mut [f32]) {
         assert_eq!(
             x.len(),
@@ -153,30 +157,41 @@ impl<'a> Ready<'a> {
             self.outputs
         );
         match &self.weights {
-            Weights::Thin(weight) => {
+            PreparedWeights::Thin(weight) => {
                 let axes = Axes::new(self.outputs, self.inputs, false);
-                thin::convolve(self.isa, grid, x, None, above, weight, axes, self.finish, y);
+                thin::convolve(
+                    self.isa,
+                    grid,
+                    x,
+                    None,
+                    above,
+                    weight,
+                    axes,
+                    self.epilogue,
+                    y,
+                );
             }
-            Weights::F2(weights) => {
-                winograd::convolve_rows::<4>(grid, x, None, above, weights, self.finish, y)
+            PreparedWeights::F2(weights) => {
+                winograd::convolve_rows::<4>(grid, x, None, above, weights, self.epilogue, y)
             }
-            Weights::F4(weights) => {
-                winograd::convolve_rows::<6>(grid, x, None, above, weights, self.finish, y)
+            PreparedWeights::F4(weights) => {
+                winograd::convolve_rows::<6>(grid, x, None, above, weights, self.epilogue, y)
             }
         }
     }
 }
 
-/// Gradients of [`forward`] for `dy`, the gradient by `y`: `dx` where asked for, `dweight`, `dbias`, all overwritten.
+/// Gradients of [`forward`]. `dy` is the gradient with respect to `y`. Overwrites `dx` (if given),
+/// `dweight` and `dbias`.
 ///
-/// `y` is the output where it was rectified: `dy` then counts where `y` is positive.
+/// If the output was rectified, `y` is that output, and `dy` counts only where `y` is positive.
 ///
 /// # Shapes
 /// As in [`forward`]; a gradient has the shape of its value.
 ///
 /// # Panics
-/// Where the lengths do not fit.
-#[allow(clippy::too_many_arguments, reason = "what a convolution is made of")]
+/// If a length does not match the others.
+#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
 pub fn backward(
     isa: Isa,
     grid: Grid,
@@ -198,13 +213,14 @@ pub fn backward(
     if let Some(dx) = &dx {
         assert_eq!(dx.len(), x.len(), "an input's gradient");
     }
-    let nothing = Finish {
+    let nothing = BiasRelu {
         bias: None,
         relu: false,
     };
     if is_wide(inputs, outputs) {
         if let Some(dx) = dx {
-            let weights = winograd::Weights::new::<TILE>(isa, weight, outputs, inputs, true);
+            let weights =
+                winograd::WinogradWeights::new::<TILE>(isa, weight, outputs, inputs, true);
             winograd::convolve::<TILE>(grid, dy, y, &weights, nothing, dx);
         }
         winograd::gradient::<TILE>(isa, grid, x, dy, y, dweight, dbias);
@@ -217,7 +233,7 @@ pub fn backward(
     }
 }
 
-/// Input and output channels.
+/// Checks all lengths and returns the input and output channels.
 fn check(grid: Grid, x: usize, weight: usize, outputs: usize, y: usize) -> (usize, usize) {
     let inputs = grid.channels(x);
     assert_eq!(

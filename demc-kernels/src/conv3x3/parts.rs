@@ -1,4 +1,4 @@
-//! What all ways to a 3x3 convolution share: how its weight is read, which map, and what happens to the result.
+//! Shared by all 3x3 convolution kernels: the layout of the weight, the input map, bias and ReLU.
 
 use crate::simd::Simd;
 
@@ -13,7 +13,7 @@ pub(super) struct Axes {
 }
 
 impl Axes {
-    /// As the convolution reads them, or (`transposed`) its gradient by the input.
+    /// For the convolution, or (`transposed`) for its gradient with respect to the input.
     pub(super) fn new(outputs: usize, inputs: usize, transposed: bool) -> Self {
         match transposed {
             false => Axes {
@@ -33,29 +33,29 @@ impl Axes {
         }
     }
 
-    /// Place of the weight from `input` to `output` at `tap`.
+    /// Index of the weight from `input` to `output` at `tap`.
     pub(super) fn place(self, input: usize, output: usize, tap: usize) -> usize {
         let tap = if self.flipped { 8 - tap } else { tap };
         input * self.input_step + output * self.output_step + tap
     }
 }
 
-/// A map to read, gated by another one where the gradient comes through a ReLU.
+/// A map to read; `gate` is the output of the ReLU that the gradient passes through.
 #[derive(Clone, Copy)]
-pub(super) struct Source<'a> {
+pub(super) struct GatedMap<'a> {
     pub(super) map: &'a [f32],
     pub(super) gate: Option<&'a [f32]>,
     pub(super) channels: usize,
 }
 
-/// What happens to the result of a convolution: bias, ReLU.
+/// Bias and ReLU, applied to the result of a convolution.
 #[derive(Clone, Copy)]
-pub(super) struct Finish<'a> {
+pub(super) struct BiasRelu<'a> {
     pub(super) bias: Option<&'a [f32]>,
     pub(super) relu: bool,
 }
 
-impl Finish<'_> {
+impl BiasRelu<'_> {
     /// The bias of `n` channels from `channel`.
     #[inline(always)]
     pub(super) unsafe fn bias<S: Simd>(&self, channel: usize, n: usize) -> S::V {

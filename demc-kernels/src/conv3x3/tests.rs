@@ -1,4 +1,4 @@
-//! Against plain float64 loops, whole and in bands.
+//! Compares with plain float64 loops, for whole maps and for bands.
 
 use super::*;
 use crate::reference;
@@ -78,25 +78,26 @@ fn bands_of_rows_are_the_whole() {
             for tile in [Tile::F2, Tile::F4] {
                 let mut whole = vec![f32::NAN; grid.pixels() * outputs];
                 forward_with(isa, tile, grid, &x, &weight, &bias, true, &mut whole);
-                let ready = Ready::new(isa, tile, &weight, &bias, true);
+                let ready = PreparedConvolution::new(isa, tile, &weight, &bias, true);
                 let mut bands = vec![f32::NAN; whole.len()];
                 for (first, end) in [(0, 4), (4, 16), (16, 23)] {
-                    let (from, to) = (usize::saturating_sub(first, 1), (end + 1).min(grid.height));
+                    let (from, target) =
+                        (usize::saturating_sub(first, 1), (end + 1).min(grid.height));
                     let row = grid.width * inputs;
                     let y = &mut bands[first * grid.width * outputs..end * grid.width * outputs];
                     let band = Grid {
-                        height: to - from,
+                        height: target - from,
                         ..grid
                     };
-                    ready.forward(band, &x[from * row..to * row], first - from, y);
+                    ready.forward(band, &x[from * row..target * row], first - from, y);
                 }
                 let differs = |i: &usize| bands[*i].to_bits() != whole[*i].to_bits();
-                let at = (0..whole.len())
+                let offset = (0..whole.len())
                     .find(differs)
                     .map(|i| (i / outputs, bands[i], whole[i]));
                 assert!(
-                    at.is_none(),
-                    "{isa} {inputs} to {outputs} {tile:?}: pixel, found, expected: {at:?}"
+                    offset.is_none(),
+                    "{isa} {inputs} to {outputs} {tile:?}: pixel, found, expected: {offset:?}"
                 );
             }
         }
@@ -111,14 +112,14 @@ fn larger_tiles_keep_1e_4() {
             let x = pattern(grid.pixels() * inputs, 1);
             let weight = pattern(outputs * inputs * 9, 2);
             let bias = pattern(outputs, 3);
-            let weights = winograd::Weights::new::<6>(isa, &weight, outputs, inputs, false);
+            let weights = winograd::WinogradWeights::new::<6>(isa, &weight, outputs, inputs, false);
             let mut y = vec![f32::NAN; grid.pixels() * outputs];
             winograd::convolve::<6>(
                 grid,
                 &x,
                 None,
                 &weights,
-                Finish {
+                BiasRelu {
                     bias: Some(&bias),
                     relu: true,
                 },

@@ -1,4 +1,4 @@
-//! The cells of the output, and the padded copies in which they lie side by side.
+//! The cells of the output, and the padded copies that hold them contiguously.
 
 use rayon::prelude::*;
 
@@ -11,7 +11,7 @@ use crate::{Grid, Isa};
 #[derive(Clone, Copy)]
 pub(super) struct Cells {
     pub(super) grid: Grid,
-    /// Cells of a row.
+    /// Cells in a row.
     pub(super) across: usize,
 }
 
@@ -23,19 +23,19 @@ impl Cells {
         }
     }
 
-    /// Cells of an image.
+    /// Cells in an image.
     pub(super) fn of_image(self) -> usize {
         (self.grid.height + 1) * self.across
     }
 
-    /// Cells of all images, one after the other.
+    /// Cells in all images.
     pub(super) fn count(self) -> usize {
         self.grid.batch * self.of_image()
     }
 
-    /// The padded inputs: what cell `m` reads at tap `(dy, dx)` lies at row `m + offset(tap)`.
+    /// The padded inputs: cell `m` reads row `m + offset(tap)` at tap `(dy, dx)`.
     ///
-    /// Every image begins with a row of zeros, which ends the one before it.
+    /// Every image starts with a row of zeros, which also ends the previous image.
     pub(super) fn inputs(self, isa: Isa, x: &[f32], channels: usize) -> Scratch {
         let Grid {
             batch,
@@ -49,14 +49,14 @@ impl Cells {
         lines
             .par_chunks_mut(self.across * channels)
             .enumerate()
-            .for_each(|(line, to)| {
+            .for_each(|(line, target)| {
                 let (image, row) = (line / (height + 1), line % (height + 1));
                 if image >= batch || row == 0 {
-                    to.fill(0.0);
+                    target.fill(0.0);
                     return;
                 }
                 let first = ((image * height + row - 1) * width) * channels;
-                let (pixels, border) = to.split_at_mut(width * channels);
+                let (pixels, border) = target.split_at_mut(width * channels);
                 copy(
                     isa,
                     Copy {
@@ -65,8 +65,8 @@ impl Cells {
                         gate: None,
                         bias: None,
                         relu: false,
-                        to: pixels,
-                        to_step: width * channels,
+                        target: pixels,
+                        target_step: width * channels,
                         rows: 1,
                         channels: width * channels,
                     },
@@ -81,7 +81,7 @@ impl Cells {
         (1 - dy) * self.across + 1 - dx
     }
 
-    /// The gradient by cells, `4 * channels` a cell, gated; and its sum over pixels.
+    /// The gated gradient by cells, `4 * channels` values per cell, and its sum over pixels.
     pub(super) fn gradients(
         self,
         isa: Isa,
@@ -118,10 +118,10 @@ impl Cells {
                 };
                 let first = ((image * 2 * height + y_row) * 2 * width) * channels;
                 for px in 0..2 {
-                    // Pixels px - 1, px + 1, ...: from the first that exists.
+                    // Pixels px - 1, px + 1, ..., from the first that exists.
                     let skipped = 1 - px;
                     let from = first + (px + 2 * skipped - 1) * channels;
-                    let to = &mut cells[skipped * wide + (2 * py + px) * channels..];
+                    let target = &mut cells[skipped * wide + (2 * py + px) * channels..];
                     copy(
                         isa,
                         Copy {
@@ -130,13 +130,13 @@ impl Cells {
                             gate: y.map(|y| &y[from..]),
                             bias: None,
                             relu: false,
-                            to: &mut *to,
-                            to_step: wide,
+                            target: &mut *target,
+                            target_step: wide,
                             rows: width,
                             channels,
                         },
                     );
-                    rows::column_sums(isa, to, wide, width, channels, sums);
+                    rows::column_sums(isa, target, wide, width, channels, sums);
                 }
             }
         });

@@ -1,12 +1,13 @@
-//! The 4x4 deconvolution with stride 2 and padding 1 (exactly twice the size): bias and ReLU fused, and its gradients.
+//! The 4x4 deconvolution with stride 2 and padding 1, which doubles the size: fused bias and ReLU,
+//! and its gradients.
 //!
-//! With the output cut into 2x2 *cells* that start one pixel outside of it, all four pixels (*phases*) of cell `(r, c)`
-//! come from the same 2x2 inputs `(r - dy, c - dx)`, by the taps `(2 dy + py, 2 dx + px)`. So the deconvolution is one
-//! sum of four products from `in` to `4 * out` channels on `(H + 1) x (W + 1)` cells, and its gradients are products of
-//! the same two matrices.
+//! The output is divided into 2x2 *cells* that start one pixel outside it. All four pixels
+//! (*phases*) of cell `(r, c)` depend on the same 2x2 inputs `(r - dy, c - dx)`, through the taps
+//! `(2 dy + py, 2 dx + px)`. So the deconvolution is a sum of four products from `in` to `4 * out`
+//! channels on `(H + 1) x (W + 1)` cells. Its gradients are products of the same two matrices.
 //!
-//! Both live in padded copies with `W + 1` cells a row: the input's one zero a row is the right border of a row and the
-//! left one of the next.
+//! Inputs and outputs are stored in padded copies with `W + 1` cells per row. The single zero in a
+//! row of inputs is the right border of that row and the left border of the next.
 
 mod cells;
 #[cfg(test)]
@@ -22,17 +23,18 @@ use crate::{Grid, Isa};
 use cells::Cells;
 use weights::packed;
 
-/// The 2x2 inputs of a cell.
+/// Offsets of the 2x2 inputs of a cell.
 const TAPS: [(usize, usize); 4] = [(0, 0), (0, 1), (1, 0), (1, 1)];
 
-/// `y = x * weight + bias`, rectified where `relu`.
+/// `y = x * weight + bias`, rectified if `relu`.
 ///
 /// # Shapes
-/// `grid` is that of `x` `[B, H, W, in]`; `weight` `[in, out, 4, 4]`, `bias` `[out]`, `y` `[B, 2H, 2W, out]`.
+/// `grid` is that of `x` `[B, H, W, in]`; `weight` `[in, out, 4, 4]`, `bias` `[out]`, `y` `[B, 2H,
+/// 2W, out]`.
 ///
 /// # Panics
-/// Where the lengths do not fit.
-#[allow(clippy::too_many_arguments, reason = "what a convolution is made of")]
+/// If a length does not match the others.
+#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
 pub fn forward(
     isa: Isa,
     grid: Grid,
@@ -43,11 +45,11 @@ pub fn forward(
     y: &mut [f32],
 ) {
     check(grid, x.len(), weight.len(), bias.len(), y.len());
-    Ready::new(isa, weight, bias, relu).forward(grid, x, 0, y);
+    PreparedDeconvolution::new(isa, weight, bias, relu).forward(grid, x, 0, y);
 }
 
 /// A deconvolution whose weights are prepared once, for maps that come in bands of rows.
-pub struct Ready<'a> {
+pub struct PreparedDeconvolution<'a> {
     isa: Isa,
     weights: [Packed; 4],
     bias: &'a [f32],
@@ -55,11 +57,11 @@ pub struct Ready<'a> {
     inputs: usize,
 }
 
-impl<'a> Ready<'a> {
-    /// Of `weight` `[in, out, 4, 4]` and `bias` `[out]`, rectified where `relu`.
+impl<'a> PreparedDeconvolution<'a> {
+    /// Prepares `weight` `[in, out, 4, 4]` and `bias` `[out]`; the output is rectified if `relu`.
     ///
     /// # Panics
-    /// Where the lengths do not fit.
+    /// If a length does not match the others.
     pub fn new(isa: Isa, weight: &[f32], bias: &'a [f32], relu: bool) -> Self {
         let outputs = bias.len();
         let inputs = weight.len() / (16 * outputs);
@@ -69,7 +71,7 @@ impl<'a> Ready<'a> {
             "a weight of {inputs} to {outputs} channels"
         );
         let weights = packed(isa, weight, inputs, outputs, false);
-        Ready {
+        PreparedDeconvolution {
             isa,
             weights,
             bias,
@@ -83,16 +85,17 @@ impl<'a> Ready<'a> {
         self.bias.len()
     }
 
-    /// Makes of the rows of `x` from `above` on as many as `y` has, twice as many as they are. Beyond the rows of `x` are
-    /// zeros: where an image goes on there, `x` holds a row more on that side.
+    /// Computes two output rows for each row of `x` from `above` on, until `y` is full. Outside `x`
+    /// the input is zero. Where the image continues, `x` must hold one more row on that side.
     ///
     /// # Shapes
-    /// `x` `[B, H, W, in]` with its `grid`, `y` `[B, 2 rows, 2W, out]`; several images only where `y` has all rows.
+    /// `x` `[B, H, W, in]` with its `grid`, `y` `[B, 2 rows, 2W, out]`; several images only where
+    /// `y` has all rows.
     ///
     /// # Panics
-    /// Where the lengths do not fit.
+    /// If a length does not match the others.
     pub fn forward(&self, grid: Grid, x: &[f32], above: usize, y: &mut [f32]) {
-        let Ready {
+        let PreparedDeconvolution {
             isa,
             weights,
             bias,
@@ -121,7 +124,7 @@ impl<'a> Ready<'a> {
             "a band of a single image"
         );
         let cells = Cells::new(grid);
-        // Those of the asked rows: a line of cells gives a row to the one above and a row to the one below.
+        // Cells of the requested rows. A line of cells contributes one row above and one row below.
         let skipped = above * cells.across;
         let cell_count = if grid.batch == 1 {
             (height / 2 + 1) * cells.across
@@ -144,7 +147,7 @@ impl<'a> Ready<'a> {
                 });
                 let mut c = Scratch::take(padded_rows(count) * wide);
                 rows::sum(isa, count, &terms, &mut c, wide);
-                // The cells of a row lie side by side in two rows of the output.
+                // The cells of a row are contiguous in two rows of the output.
                 let mut cell = first;
                 while cell < first + count {
                     let (line, column) = (cell / cells.across, cell % cells.across);
@@ -158,7 +161,7 @@ impl<'a> Ready<'a> {
                         else {
                             continue;
                         };
-                        // Cells whose pixel 2 * column + px - 1 exists.
+                        // Skips cells whose pixel 2 * column + px - 1 does not exist.
                         let skipped = usize::from(2 * column + px == 0);
                         let past = usize::from(2 * (column + run - 1) + px > 2 * grid.width);
                         if skipped + past >= run {
@@ -169,9 +172,10 @@ impl<'a> Ready<'a> {
                             (image * height + y_row) * 2 * grid.width + 2 * (column + skipped) + px
                                 - 1;
                         let len = ((rows - 1) * 2 + 1) * outputs;
-                        // SAFETY: tasks write the pixels of different cells, and a phase is one pixel of a cell; the slice spans
-                        // pixels of other phases too, which nobody but this task's own loop writes meanwhile.
-                        let to = unsafe {
+                        // SAFETY: tasks write the pixels of different cells, and a phase is one
+                        // pixel of a cell. The slice also spans pixels of other phases, which only
+                        // this task's own loop writes.
+                        let target = unsafe {
                             std::slice::from_raw_parts_mut(
                                 shared.pointer().add(pixel * outputs),
                                 len,
@@ -185,8 +189,8 @@ impl<'a> Ready<'a> {
                                 gate: None,
                                 bias: Some(bias),
                                 relu,
-                                to,
-                                to_step: 2 * outputs,
+                                target,
+                                target_step: 2 * outputs,
                                 rows,
                                 channels: outputs,
                             },
@@ -198,16 +202,17 @@ impl<'a> Ready<'a> {
     }
 }
 
-/// Gradients of [`forward`] for `dy`, the gradient by `y`: `dx` where asked for, `dweight`, `dbias`, all overwritten.
+/// Gradients of [`forward`]. `dy` is the gradient with respect to `y`. Overwrites `dx` (if given),
+/// `dweight` and `dbias`.
 ///
-/// `y` is the output where it was rectified: `dy` then counts where `y` is positive.
+/// If the output was rectified, `y` is that output, and `dy` counts only where `y` is positive.
 ///
 /// # Shapes
 /// As in [`forward`]; a gradient has the shape of its value.
 ///
 /// # Panics
-/// Where the lengths do not fit.
-#[allow(clippy::too_many_arguments, reason = "what a convolution is made of")]
+/// If a length does not match the others.
+#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
 pub fn backward(
     isa: Isa,
     grid: Grid,
@@ -254,7 +259,8 @@ pub fn backward(
                 });
                 let mut c = Scratch::take(padded_rows(count) * c_step);
                 rows::sum(isa, count, &terms, &mut c, c_step);
-                // Of the cells of a row all but the last are pixels of the input, of the rows all but the last.
+                // All cells of a row but the last are pixels of the input, in all rows but the
+                // last.
                 let mut cell = first;
                 while cell < first + count {
                     let (line, column) = (cell / cells.across, cell % cells.across);
@@ -264,7 +270,7 @@ pub fn backward(
                     if row < grid.height && rows > 0 {
                         let pixel = (image * grid.height + row) * grid.width + column;
                         // SAFETY: tasks write different pixels.
-                        let to = unsafe {
+                        let target = unsafe {
                             std::slice::from_raw_parts_mut(
                                 shared.pointer().add(pixel * inputs),
                                 rows * inputs,
@@ -278,8 +284,8 @@ pub fn backward(
                                 gate: None,
                                 bias: None,
                                 relu: false,
-                                to,
-                                to_step: inputs,
+                                target,
+                                target_step: inputs,
                                 rows,
                                 channels: inputs,
                             },
@@ -317,7 +323,7 @@ pub fn backward(
         });
 }
 
-/// Input and output channels.
+/// Checks all lengths and returns the input and output channels.
 fn check(grid: Grid, x: usize, weight: usize, outputs: usize, y: usize) -> (usize, usize) {
     let inputs = grid.channels(x);
     assert_eq!(

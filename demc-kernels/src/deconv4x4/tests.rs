@@ -1,4 +1,4 @@
-//! Against plain float64 loops, whole and in bands.
+//! Compares with plain float64 loops, for whole maps and for bands.
 
 use super::*;
 use crate::reference;
@@ -20,18 +20,18 @@ fn bands_of_rows_are_the_whole() {
         let bias = pattern(outputs, 3);
         let mut whole = vec![f32::NAN; grid.doubled().pixels() * outputs];
         forward(isa, grid, &x, &weight, &bias, true, &mut whole);
-        let ready = Ready::new(isa, &weight, &bias, true);
+        let ready = PreparedDeconvolution::new(isa, &weight, &bias, true);
         let mut bands = vec![f32::NAN; whole.len()];
         for (first, end) in [(0, 1), (1, 7), (7, 11)] {
-            let (from, to) = (usize::saturating_sub(first, 1), (end + 1).min(grid.height));
+            let (from, target) = (usize::saturating_sub(first, 1), (end + 1).min(grid.height));
             let (row, y_row) = (grid.width * inputs, 4 * grid.width * outputs);
             let band = Grid {
-                height: to - from,
+                height: target - from,
                 ..grid
             };
             ready.forward(
                 band,
-                &x[from * row..to * row],
+                &x[from * row..target * row],
                 first - from,
                 &mut bands[first * y_row..end * y_row],
             );

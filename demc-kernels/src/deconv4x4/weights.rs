@@ -1,4 +1,4 @@
-//! A weight as four matrices, one a tap.
+//! A weight as four matrices, one per tap.
 
 use std::ops::Range;
 
@@ -11,24 +11,24 @@ use crate::rows::Packed;
 use crate::scratch::Shared;
 use crate::simd::{Leaf, Simd, WIDEST, run};
 
-/// Packs a weight `[in, out, 4, 4]` by taps: some inputs' rows of `in x 4 out` matrices, or transposed some outputs'
-/// of `4 out x in`.
-struct Pack<'a> {
+/// Packs a weight `[in, out, 4, 4]` by taps. Each task packs the rows of some inputs of `in x 4
+/// out` matrices, or (transposed) the rows of some outputs of `4 out x in` matrices.
+struct PackTaps<'a> {
     weight: &'a [f32],
     inputs: usize,
     outputs: usize,
     transposed: bool,
     /// Inputs, or outputs where transposed.
     range: Range<usize>,
-    to: [Shared; 4],
+    target: [Shared; 4],
 }
 
-impl Leaf for Pack<'_> {
+impl Leaf for PackTaps<'_> {
     type Out = ();
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let Pack {
+        let PackTaps {
             inputs,
             outputs,
             transposed,
@@ -39,7 +39,7 @@ impl Leaf for Pack<'_> {
             true => (4 * outputs, inputs, inputs),
         };
         let panels = Panels::new::<S>(columns);
-        // Outputs side by side in the file are taken side by side: a cache line each.
+        // Adjacent outputs in the file are read together, one cache line each.
         for first in (0..lanes_of).step_by(S::LANES) {
             for index in self.range.clone() {
                 let count = S::LANES.min(lanes_of - first);
@@ -58,22 +58,23 @@ impl Leaf for Pack<'_> {
                 for (t, values) in taps.iter().enumerate() {
                     let (y, x) = (t / 4, t % 4);
                     let (tap, phase) = (y / 2 * 2 + x / 2, y % 2 * 2 + x % 2);
-                    let to = self.to[tap].pointer();
+                    let target = self.target[tap].pointer();
                     let (row, column) = if transposed {
                         (phase * outputs + index, first)
                     } else {
                         (index, phase * outputs + first)
                     };
-                    // SAFETY: the row of this index is this leaf's; vectors and columns lie within the operand.
+                    // SAFETY: the row of this index is this leaf's; vectors and columns lie within
+                    // the operand.
                     unsafe {
                         if column % S::LANES == 0 && (count == S::LANES || transposed) {
                             S::store(
-                                to.add(panels.place(depth, row, column)),
+                                target.add(panels.place(depth, row, column)),
                                 S::load(values.as_ptr()),
                             );
                         } else {
                             for (lane, value) in values[..count].iter().enumerate() {
-                                *to.add(panels.place(depth, row, column + lane)) = *value;
+                                *target.add(panels.place(depth, row, column + lane)) = *value;
                             }
                         }
                     }
@@ -83,7 +84,7 @@ impl Leaf for Pack<'_> {
     }
 }
 
-/// The four matrices of a weight, of [`TAPS`].
+/// The four matrices of a weight, one for each of [`TAPS`].
 pub(super) fn packed(
     isa: Isa,
     weight: &[f32],
@@ -97,7 +98,7 @@ pub(super) fn packed(
     };
     let mut packed = TAPS.map(|_| Packed::empty(depth, columns));
     let [a, b, c, d] = &mut packed;
-    let to = [a.values(), b.values(), c.values(), d.values()];
+    let target = [a.values(), b.values(), c.values(), d.values()];
     let step = (2048 / (inputs * outputs / count)).max(1);
     (0..count.div_ceil(step)).into_par_iter().for_each(|task| {
         let range = task * step..((task + 1) * step).min(count);
@@ -105,13 +106,13 @@ pub(super) fn packed(
         unsafe {
             run(
                 isa,
-                Pack {
+                PackTaps {
                     weight,
                     inputs,
                     outputs,
                     transposed,
                     range,
-                    to,
+                    target,
                 },
             )
         };

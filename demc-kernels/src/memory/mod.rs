@@ -1,9 +1,12 @@
-//! Large buffers that are used again: an allocator for binaries that train or denoise.
+//! Reuse of large buffers: an allocator for binaries that train or denoise.
 //!
-//! A training step asks for the same few hundred maps every time. The system's allocator gives each back to the system
-//! and fetches it again, at a page fault every 4 KiB and a page's zeros written before ours: a seventh of a step's time at
-//! C = 64. [`Recycler`] keeps freed blocks of 64 KiB and more for the next ones, on Linux, on pages of 2 MiB where there
-//! are; it holds 8 MiB more than the process once used and no more, and leaves everything smaller to the system's allocator.
+//! Each training step allocates the same few hundred maps. The system's allocator returns each to
+//! the system and fetches it again. That costs a page fault every 4 KiB and zeros every page: a
+//! seventh of a step's time at C = 64.
+//!
+//! [`Recycler`] keeps freed blocks of 64 KiB and more for later allocations. It works on Linux and
+//! uses pages of 2 MiB where available. It holds at most 8 MiB more than the peak use of the
+//! process. Smaller allocations go to the system's allocator.
 //!
 //! ```no_run
 //! #[global_allocator]
@@ -15,42 +18,42 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// A large page of Linux, bytes: memory is fetched from the system in multiples of it.
+/// Size of a large page on Linux, in bytes. Memory is requested from the system in multiples of it.
 const LARGE: usize = 2 << 20;
 
-/// Bytes that may be held beyond what the process once used: the rests of large pages.
+/// Bytes that may be held above the peak use of the process: the rest of large pages.
 const SLACK: usize = 4 * LARGE;
 
-/// The smallest block, and what sizes are rounded up to, bytes.
+/// Size of the smallest block, in bytes; block sizes are multiples of it.
 const GRAIN: usize = 64 << 10;
 
-/// Blocks that can be kept at a time; more go back to the system.
+/// Maximum number of free blocks; further blocks are returned to the system.
 const MOST_KEPT: usize = 512;
 
-/// The system's allocator, but on Linux for large blocks, which it keeps.
+/// The system's allocator, except that it keeps freed large blocks on Linux.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Recycler;
 
-/// A stretch of free memory.
+/// A range of free memory.
 #[derive(Clone, Copy)]
-struct Block {
+struct FreeBlock {
     address: usize,
     size: usize,
 }
 
-/// The memory that is kept: an array, because an allocator cannot allocate.
-struct Kept {
-    blocks: [Block; MOST_KEPT],
+/// The free memory, as an array, because an allocator cannot allocate.
+struct FreeList {
+    blocks: [FreeBlock; MOST_KEPT],
     count: usize,
     /// Bytes of all blocks.
     bytes: usize,
-    /// Bytes that the process uses, and the most so far.
+    /// Bytes in use, and their maximum so far.
     used: usize,
     most_used: usize,
 }
 
-static KEPT: Mutex<Kept> = Mutex::new(Kept {
-    blocks: [Block {
+static KEPT: Mutex<FreeList> = Mutex::new(FreeList {
+    blocks: [FreeBlock {
         address: 0,
         size: 0,
     }; MOST_KEPT],
@@ -59,11 +62,11 @@ static KEPT: Mutex<Kept> = Mutex::new(Kept {
     used: 0,
     most_used: 0,
 });
-/// Whether this is the allocator of the process.
+/// Whether [`Recycler`] is the allocator of the process.
 static INSTALLED: AtomicBool = AtomicBool::new(false);
 
-impl Kept {
-    fn remove(&mut self, index: usize) -> Block {
+impl FreeList {
+    fn remove(&mut self, index: usize) -> FreeBlock {
         let block = self.blocks[index];
         self.count -= 1;
         self.blocks[index] = self.blocks[self.count];
@@ -71,13 +74,13 @@ impl Kept {
         block
     }
 
-    fn insert(&mut self, block: Block) {
+    fn insert(&mut self, block: FreeBlock) {
         self.blocks[self.count] = block;
         self.count += 1;
         self.bytes += block.size;
     }
 
-    /// Memory of this size, cut from the smallest block that has it.
+    /// Takes `size` bytes from the smallest block that has them.
     fn take(&mut self, size: usize) -> Option<usize> {
         self.used += size;
         self.most_used = self.most_used.max(self.used);
@@ -86,8 +89,8 @@ impl Kept {
             .min_by_key(|i| self.blocks[*i].size)
             .map(|i| self.remove(i))?;
         if block.size > size {
-            // From the end, so that what stays begins where a large page does.
-            self.insert(Block {
+            // From the end, so that the rest still starts at a large page.
+            self.insert(FreeBlock {
                 address: block.address,
                 size: block.size - size,
             });
@@ -95,14 +98,15 @@ impl Kept {
         Some(block.address + block.size - size)
     }
 
-    /// Takes memory back that was used.
-    fn put(&mut self, block: Block) -> Option<Block> {
+    /// Takes back memory that was in use.
+    fn put(&mut self, block: FreeBlock) -> Option<FreeBlock> {
         self.used -= block.size;
         self.keep(block)
     }
 
-    /// Keeps memory, joined with its neighbours; the memory itself where there is no room for one more block.
-    fn keep(&mut self, mut block: Block) -> Option<Block> {
+    /// Keeps memory, joined with its neighbours. Returns the memory if there is no room for another
+    /// block.
+    fn keep(&mut self, mut block: FreeBlock) -> Option<FreeBlock> {
         for index in (0..self.count).rev() {
             let other = self.blocks[index];
             let (below, above) = (
@@ -111,7 +115,7 @@ impl Kept {
             );
             if below || above {
                 self.remove(index);
-                block = Block {
+                block = FreeBlock {
                     address: block.address.min(other.address),
                     size: block.size + other.size,
                 };
@@ -124,20 +128,20 @@ impl Kept {
         None
     }
 
-    /// A block to give back to the system: the smallest one, while more is held than the process once used. So what a
-    /// phase of a run leaves behind goes back, and splinters go first.
-    fn surplus(&mut self) -> Option<Block> {
+    /// Removes a block to return to the system: the smallest one, as long as more is held than the
+    /// peak use. This returns the memory of finished phases of a run, smallest pieces first.
+    fn surplus(&mut self) -> Option<FreeBlock> {
         let too_much = self.used + self.bytes > self.most_used + SLACK;
         let smallest = (0..self.count).min_by_key(|i| self.blocks[*i].size);
         smallest.filter(|_| too_much).map(|i| self.remove(i))
     }
 }
 
-fn kept() -> std::sync::MutexGuard<'static, Kept> {
+fn kept() -> std::sync::MutexGuard<'static, FreeList> {
     KEPT.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
 }
 
-/// Bytes of the block for an allocation; none where the system's allocator has it.
+/// Size of the block for an allocation, in bytes; `None` if the system's allocator serves it.
 fn block_size(size: usize, align: usize) -> Option<usize> {
     let large = cfg!(all(target_os = "linux", not(miri))) && size >= GRAIN && align <= GRAIN;
     large
@@ -145,17 +149,17 @@ fn block_size(size: usize, align: usize) -> Option<usize> {
         .flatten()
 }
 
-/// A block, all of it initialised, and whether it is zeros; null where there is no memory.
+/// An initialised block, and whether it is zeroed; null if there is no memory.
 fn block(size: usize) -> (*mut u8, bool) {
     if let Some(address) = kept().take(size) {
         return (std::ptr::with_exposed_provenance_mut(address), false);
     }
-    // Pieces too small for this must not make the process larger than what it uses.
+    // Before the process grows, blocks that are too small for this request are returned.
     give_back(None);
     let mapped = size.next_multiple_of(LARGE);
     let pointer = system::map(mapped);
     if mapped > size && !pointer.is_null() {
-        let rest = Block {
+        let rest = FreeBlock {
             address: pointer.expose_provenance() + size,
             size: mapped - size,
         };
@@ -168,29 +172,29 @@ fn block(size: usize) -> (*mut u8, bool) {
 /// Takes back a block.
 ///
 /// # Safety
-/// It came from [`block`], of this size, and nobody uses it any more.
+/// The block came from [`block`] with this size and is no longer used.
 unsafe fn release(pointer: *mut u8, size: usize) {
-    let rejected = kept().put(Block {
+    let rejected = kept().put(FreeBlock {
         address: pointer.expose_provenance(),
         size,
     });
     give_back(rejected);
 }
 
-/// Gives a block that was not kept, and all surplus, back to the system.
-fn give_back(mut surplus: Option<Block>) {
-    while let Some(Block { address, size }) = surplus.take().or_else(|| kept().surplus()) {
-        // SAFETY: joined blocks are whole pages that were mapped; these were kept, so they are nobody's.
+/// Returns a block that was not kept, and all surplus blocks, to the system.
+fn give_back(mut surplus: Option<FreeBlock>) {
+    while let Some(FreeBlock { address, size }) = surplus.take().or_else(|| kept().surplus()) {
+        // SAFETY: joined blocks are whole mapped pages. They were free, so nothing uses them.
         unsafe { system::unmap(std::ptr::with_exposed_provenance_mut(address), size) };
     }
 }
 
-/// Where blocks come from: the kernel.
+/// Memory from the operating system.
 #[cfg(all(target_os = "linux", not(miri)))]
 mod system {
     use super::LARGE;
 
-    /// Zeroed pages at a multiple of a large page; null where there are none.
+    /// Zeroed pages at a multiple of a large page; null if there are none.
     pub(super) fn map(size: usize) -> *mut u8 {
         let Some(with_room) = size.checked_add(LARGE) else {
             return std::ptr::null_mut();
@@ -199,7 +203,8 @@ mod system {
             libc::PROT_READ | libc::PROT_WRITE,
             libc::MAP_PRIVATE | libc::MAP_ANONYMOUS,
         );
-        // SAFETY: a mapping at an address of the kernel's choice; what is unmapped is its own unused ends.
+        // SAFETY: the kernel chooses the address. Only the unused ends of this mapping are
+        // unmapped.
         unsafe {
             let start = libc::mmap(std::ptr::null_mut(), with_room, access, kind, -1, 0);
             if start == libc::MAP_FAILED {
@@ -213,23 +218,23 @@ mod system {
             if LARGE > head {
                 libc::munmap(block.byte_add(size), LARGE - head);
             }
-            // Refused by kernels without large pages: small ones do as well.
+            // Kernels without large pages refuse this; small pages work, too.
             libc::madvise(block, size, libc::MADV_HUGEPAGE);
             block.cast()
         }
     }
 
-    /// Gives pages back.
+    /// Returns pages to the system.
     ///
     /// # Safety
-    /// They came from [`map`], and nobody uses them any more.
+    /// They came from [`map`] and are no longer used.
     pub(super) unsafe fn unmap(block: *mut u8, size: usize) {
-        // SAFETY: the caller's.
+        // SAFETY: guaranteed by the caller.
         unsafe { libc::munmap(block.cast(), size) };
     }
 }
 
-/// Nowhere: no block is large.
+/// Other systems: no block is large.
 #[cfg(not(all(target_os = "linux", not(miri))))]
 mod system {
     pub(super) fn map(_size: usize) -> *mut u8 {
@@ -239,31 +244,31 @@ mod system {
     pub(super) unsafe fn unmap(_block: *mut u8, _size: usize) {}
 }
 
-/// A buffer of `len` values to write into: those of an earlier user where [`Recycler`] is the process's allocator, so
-/// that no time goes into zeros that nobody reads; zeros elsewhere.
+/// A buffer of `len` values to overwrite. If [`Recycler`] is the allocator, it holds old values,
+/// which saves the time for zeroing. Otherwise it holds zeros.
 pub fn buffer(len: usize) -> Vec<f32> {
     // SAFETY: any bits are a float.
     unsafe { recycled(len) }.unwrap_or_else(|| vec![0.0; len])
 }
 
-/// Bytes of free memory that is kept for the next large blocks.
+/// Bytes of free memory that is kept for later large blocks.
 pub fn kept_bytes() -> usize {
     kept().bytes
 }
 
-/// Bytes in large blocks that the process uses, and the most that it used at a time; 0 where [`Recycler`] is not its
-/// allocator.
+/// Bytes of large blocks in use, and their maximum so far; 0 if [`Recycler`] is not the allocator.
 pub fn used() -> [usize; 2] {
     let kept = kept();
     [kept.used, kept.most_used]
 }
 
-/// Whether `len` values of a type are kept when they are dropped.
+/// Whether the memory of `len` values of `T` is kept when they are dropped.
 pub(crate) fn recycles<T>(len: usize) -> bool {
     kept_size::<T>(len).is_some()
 }
 
-/// Bytes of the block for `len` values, where [`Recycler`] is the process's allocator and they are large.
+/// Size in bytes of the block for `len` values of `T`, if they are large and [`Recycler`] is the
+/// allocator.
 fn kept_size<T>(len: usize) -> Option<usize> {
     let size = len
         .checked_mul(size_of::<T>())
@@ -271,7 +276,7 @@ fn kept_size<T>(len: usize) -> Option<usize> {
     size.filter(|_| INSTALLED.load(Ordering::Relaxed))
 }
 
-/// `len` values of an earlier user, where they are large and [`Recycler`] is the process's allocator.
+/// A recycled buffer of `len` values, if they are large and [`Recycler`] is the allocator.
 ///
 /// # Safety
 /// Any bits are a value of `T`.
@@ -279,13 +284,14 @@ pub(crate) unsafe fn recycled<T>(len: usize) -> Option<Vec<T>> {
     let size = kept_size::<T>(len)?;
     let (pointer, _) = block(size);
     assert!(!pointer.is_null(), "no memory for {size} bytes");
-    // SAFETY: the block is initialised, for the kernel's pages are zeros, `len` values fit, and it lies at a multiple of
-    // GRAIN. Recycler, which is the process's allocator, takes it back by the layout of `len` values.
+    // SAFETY: the block is initialised, since the kernel's pages are zeros. `len` values fit, and
+    // it lies at a multiple of GRAIN. Recycler is the allocator and takes the block back by the
+    // layout of `len` values.
     Some(unsafe { Vec::from_raw_parts(pointer.cast(), len, len) })
 }
 
-// SAFETY: whether an allocation is a block, and of which size, depends on its layout alone, so that `dealloc` and
-// `realloc` find it again; blocks are disjoint. All else is `System`'s.
+// SAFETY: whether an allocation is a block, and its size, depend on its layout alone, so `dealloc`
+// and `realloc` find it again. Blocks are disjoint. The rest is delegated to `System`.
 unsafe impl GlobalAlloc for Recycler {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         match block_size(layout.size(), layout.align()) {
@@ -293,7 +299,7 @@ unsafe impl GlobalAlloc for Recycler {
                 INSTALLED.store(true, Ordering::Relaxed);
                 block(size).0
             }
-            // SAFETY: the caller's.
+            // SAFETY: guaranteed by the caller.
             None => unsafe { System.alloc(layout) },
         }
     }
@@ -309,13 +315,13 @@ unsafe impl GlobalAlloc for Recycler {
                 }
                 pointer
             }
-            // SAFETY: the caller's.
+            // SAFETY: guaranteed by the caller.
             None => unsafe { System.alloc_zeroed(layout) },
         }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's; a block's size is that of its layout.
+        // SAFETY: guaranteed by the caller; the size of a block follows from its layout.
         unsafe {
             match block_size(layout.size(), layout.align()) {
                 Some(size) => release(pointer, size),
@@ -333,13 +339,13 @@ unsafe impl GlobalAlloc for Recycler {
             block_size(size, layout.align()),
         );
         if old.is_none() && new.is_none() {
-            // SAFETY: the caller's.
+            // SAFETY: guaranteed by the caller.
             return unsafe { System.realloc(pointer, layout, size) };
         }
         if old == new {
             return pointer;
         }
-        // SAFETY: both hold the smaller of the sizes, and the old one is given up.
+        // SAFETY: both hold the smaller of the two sizes, and the old block is released.
         unsafe {
             let moved = self.alloc(grown);
             if !moved.is_null() {

@@ -1,14 +1,15 @@
-//! The allocator that these tests run on, and its bookkeeping.
+//! Tests the allocator by running on it, and tests its bookkeeping.
 
 use super::*;
 
-/// Of all tests of this crate: what [`Recycler`] gave out, it must take back.
+/// The allocator of all tests of this crate: [`Recycler`] must take back every block that it
+/// returned.
 #[global_allocator]
 static ALLOCATOR: Recycler = Recycler;
 
 #[test]
 fn a_large_block_comes_back_and_is_zeroed_where_asked() {
-    // Under Miri all memory is the system's, and slow.
+    // Under Miri all memory is the system's, and Miri is slow.
     let size = if cfg!(miri) { 100 } else { 3 * LARGE - 100 };
     let layout = Layout::from_size_align(size, 64).expect("a layout");
     // SAFETY: allocated, used within and freed with one layout.
@@ -48,8 +49,8 @@ fn growing_keeps_the_values_across_the_bound() {
 
 #[test]
 fn memory_is_cut_and_joined_again() {
-    let mut kept = Kept {
-        blocks: [Block {
+    let mut kept = FreeList {
+        blocks: [FreeBlock {
             address: 0,
             size: 0,
         }; MOST_KEPT],
@@ -60,7 +61,7 @@ fn memory_is_cut_and_joined_again() {
     };
     assert_eq!(kept.take(10), None);
     assert!(
-        kept.put(Block {
+        kept.put(FreeBlock {
             address: 100,
             size: 10
         })
@@ -72,14 +73,14 @@ fn memory_is_cut_and_joined_again() {
     );
     assert_eq!((start, end), (100, 106));
     assert!(
-        kept.put(Block {
+        kept.put(FreeBlock {
             address: end,
             size: 4
         })
         .is_none()
     );
     assert!(
-        kept.put(Block {
+        kept.put(FreeBlock {
             address: start,
             size: 6
         })
@@ -89,10 +90,10 @@ fn memory_is_cut_and_joined_again() {
         (kept.count, kept.bytes, kept.blocks[0].address),
         (1, 10, 100)
     );
-    // Little more than was ever used is kept.
+    // Little more than the peak use is kept.
     assert_eq!(kept.take(SLACK), None);
     assert!(
-        kept.put(Block {
+        kept.put(FreeBlock {
             address: 200,
             size: SLACK
         })
@@ -101,7 +102,7 @@ fn memory_is_cut_and_joined_again() {
     assert!(kept.surplus().is_none());
     assert_eq!(kept.take(2 * SLACK + 1), None);
     assert!(
-        kept.put(Block {
+        kept.put(FreeBlock {
             address: 2 * SLACK,
             size: 2 * SLACK + 1
         })

@@ -1,19 +1,19 @@
-//! Rows of channels copied and summed through vectors.
+//! Vectorised copies and sums of rows of channels.
 
 use crate::Isa;
 use crate::simd::{Leaf, Simd, WIDEST, run};
 
-/// Copies rows of channels through vectors: gate, bias, ReLU on the way.
+/// Copies rows of channels, with optional gate, bias and ReLU.
 pub(crate) struct Copy<'a> {
-    /// Rows and the distance between them.
+    /// The rows; `from_step` is the distance between them.
     pub(crate) from: &'a [f32],
     pub(crate) from_step: usize,
-    /// Gate of `from`, laid out as it.
+    /// Gate of `from`, in the same layout.
     pub(crate) gate: Option<&'a [f32]>,
     pub(crate) bias: Option<&'a [f32]>,
     pub(crate) relu: bool,
-    pub(crate) to: &'a mut [f32],
-    pub(crate) to_step: usize,
+    pub(crate) target: &'a mut [f32],
+    pub(crate) target_step: usize,
     pub(crate) rows: usize,
     pub(crate) channels: usize,
 }
@@ -28,7 +28,7 @@ impl Leaf for Copy<'_> {
         }
         let Copy {
             from_step,
-            to_step,
+            target_step,
             channels,
             ..
         } = self;
@@ -37,7 +37,7 @@ impl Leaf for Copy<'_> {
             "rows to copy from"
         );
         assert!(
-            self.to.len() >= (self.rows - 1) * to_step + channels,
+            self.target.len() >= (self.rows - 1) * target_step + channels,
             "rows to copy to"
         );
         assert!(
@@ -61,11 +61,11 @@ impl Leaf for Copy<'_> {
                     if self.relu {
                         v = S::relu(v);
                     }
-                    let to = self.to.as_mut_ptr().add(row * to_step + channel);
+                    let target = self.target.as_mut_ptr().add(row * target_step + channel);
                     if n == S::LANES {
-                        S::store(to, v)
+                        S::store(target, v)
                     } else {
-                        S::store_part(to, n, v)
+                        S::store_part(target, n, v)
                     }
                 }
             }
@@ -76,10 +76,10 @@ impl Leaf for Copy<'_> {
 /// `n` values from `p`.
 ///
 /// # Safety
-/// They are there, and so is the path of `S`.
+/// The values are readable, and the machine has the path of `S`.
 #[inline(always)]
 unsafe fn part<S: Simd>(p: *const f32, n: usize) -> S::V {
-    // SAFETY: the caller's.
+    // SAFETY: guaranteed by the caller.
     unsafe {
         if n == S::LANES {
             S::load(p)
@@ -89,13 +89,13 @@ unsafe fn part<S: Simd>(p: *const f32, n: usize) -> S::V {
     }
 }
 
-/// Runs a [`Copy`].
+/// Runs a [struct@Copy].
 pub(crate) fn copy(isa: Isa, copy: Copy) {
     // SAFETY: the leaf checks its lengths.
     unsafe { run(isa, copy) }
 }
 
-/// Sum over rows of each channel: some `rows` (their number small enough for float32), `step` values apart.
+/// Sum over rows of each channel. Rows are `step` values apart, and few enough for sums in float32.
 struct ColumnSums<'a> {
     rows: &'a [f32],
     step: usize,
@@ -135,7 +135,7 @@ impl Leaf for ColumnSums<'_> {
     }
 }
 
-/// Adds the sum over `count` rows, `step` values apart, of each channel.
+/// Adds to `sums` the sum of each channel over `count` rows, `step` values apart.
 pub(crate) fn column_sums(
     isa: Isa,
     rows: &[f32],

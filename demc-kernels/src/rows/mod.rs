@@ -1,8 +1,9 @@
-//! Products over pixels as they lie in memory: what the 1x1 convolution and the deconvolution are made of.
+//! Products over contiguous pixels: the basis of the 1x1 convolution and the deconvolution.
 //!
-//! A *run* is a stretch of pixels, each a row of channels. Forward, rows of pixels times a packed weight; backward, the
-//! transposed weight the same way, and for the weight's gradient a reduction over pixels. A convolution with several
-//! taps or several inputs is a sum of such products, each from another place.
+//! A *run* is a range of pixels, each a row of channels. The forward pass multiplies rows of pixels
+//! by a packed weight. The backward pass multiplies by the transposed weight; the gradient of the
+//! weight is a reduction over pixels. A convolution with several taps or inputs is a sum of such
+//! products over different rows.
 
 mod copy;
 mod outer;
@@ -15,12 +16,12 @@ use crate::scratch::{Scratch, Shared};
 use crate::simd::{Leaf, Simd, run};
 
 pub(crate) use copy::{Copy, column_sums, copy};
-pub(crate) use outer::{Outer, Window, add_outer, outer};
+pub(crate) use outer::{Outer, PaddedRows, add_outer, outer};
 
-/// Most rows of a product that are made at once.
+/// Maximum number of rows of a product that are computed at once.
 pub(crate) const BLOCK: usize = 96;
 
-/// Columns rounded up to what every path's vectors fill.
+/// Columns rounded up to whole vectors of every path.
 pub(crate) fn whole(columns: usize) -> usize {
     columns.next_multiple_of(16)
 }
@@ -32,15 +33,15 @@ pub(crate) struct Packed {
     values: Scratch,
 }
 
-struct Pack<'a, F> {
+struct PackRows<'a, F> {
     rows: std::ops::Range<usize>,
     depth: usize,
     columns: usize,
     value: &'a F,
-    to: Shared,
+    target: Shared,
 }
 
-impl<F: Fn(usize, usize) -> f32> Leaf for Pack<'_, F> {
+impl<F: Fn(usize, usize) -> f32> Leaf for PackRows<'_, F> {
     type Out = ();
 
     #[inline(always)]
@@ -57,7 +58,7 @@ impl<F: Fn(usize, usize) -> f32> Leaf for Pack<'_, F> {
                         0.0
                     };
                     // SAFETY: row `k` is this leaf's, and its vectors lie within the operand.
-                    unsafe { *self.to.pointer().add(place + lane) = value };
+                    unsafe { *self.target.pointer().add(place + lane) = value };
                 }
             }
         }
@@ -65,7 +66,7 @@ impl<F: Fn(usize, usize) -> f32> Leaf for Pack<'_, F> {
 }
 
 impl Packed {
-    /// The weight whose entry in row `k` and a column is `value(k, column)`.
+    /// Packs a weight with the entry `value(k, column)` in row `k`.
     pub(crate) fn new(
         isa: Isa,
         depth: usize,
@@ -73,7 +74,7 @@ impl Packed {
         value: impl Fn(usize, usize) -> f32 + Sync,
     ) -> Self {
         let mut values = Scratch::take(depth * whole(columns));
-        let to = Shared::new(&mut values);
+        let target = Shared::new(&mut values);
         let step = (8192 / columns).max(1);
         (0..depth.div_ceil(step)).into_par_iter().for_each(|task| {
             let rows = task * step..((task + 1) * step).min(depth);
@@ -81,12 +82,12 @@ impl Packed {
             unsafe {
                 run(
                     isa,
-                    Pack {
+                    PackRows {
                         rows,
                         depth,
                         columns,
                         value: &value,
-                        to,
+                        target,
                     },
                 )
             };
@@ -98,7 +99,7 @@ impl Packed {
         }
     }
 
-    /// A weight `[depth, columns]` whose packed values the caller writes.
+    /// A weight `[depth, columns]`; the caller writes the packed values.
     pub(crate) fn empty(depth: usize, columns: usize) -> Self {
         Packed {
             depth,
@@ -107,7 +108,7 @@ impl Packed {
         }
     }
 
-    /// Its columns.
+    /// Number of columns.
     pub(crate) fn columns(&self) -> usize {
         self.columns
     }
@@ -118,7 +119,7 @@ impl Packed {
     }
 }
 
-/// Rows of a block, at most [`BLOCK`], of which there are enough for all threads.
+/// Rows per block, at most [`BLOCK`], chosen so that there are enough blocks for all threads.
 pub(crate) fn block_rows(rows: usize) -> usize {
     let blocks = rows
         .div_ceil(BLOCK)
@@ -126,7 +127,7 @@ pub(crate) fn block_rows(rows: usize) -> usize {
     rows.div_ceil(blocks)
 }
 
-/// One term of a sum of products: rows from `start`, `step` values apart, times a weight.
+/// One term of a sum of products: rows `step` values apart, times a weight.
 #[derive(Clone, Copy)]
 pub(crate) struct Term<'a> {
     pub(crate) rows: &'a [f32],
@@ -180,10 +181,10 @@ impl Leaf for Sum<'_> {
     }
 }
 
-/// The sum of the terms, `count` rows into `c`, whose rows are `c_step` values apart.
+/// Writes the sum of the terms, `count` rows, to `c`; the rows of `c` are `c_step` values apart.
 ///
 /// # Panics
-/// Where a slice is shorter than [`padded_rows`] of `count` need.
+/// If a slice is shorter than [`padded_rows`] of `count` requires.
 pub(crate) fn sum(isa: Isa, count: usize, terms: &[Term], c: &mut [f32], c_step: usize) {
     // SAFETY: the leaf checks its lengths.
     unsafe {
@@ -200,7 +201,7 @@ pub(crate) fn sum(isa: Isa, count: usize, terms: &[Term], c: &mut [f32], c_step:
     }
 }
 
-/// The same, added to what `c` holds.
+/// As [`sum`], added to the content of `c`.
 pub(crate) fn add_sum(isa: Isa, count: usize, terms: &[Term], c: &mut [f32], c_step: usize) {
     // SAFETY: the leaf checks its lengths.
     unsafe {

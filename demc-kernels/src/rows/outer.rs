@@ -1,4 +1,4 @@
-//! Gradients of weights: products whose reduction runs over pixels.
+//! Gradients of weights: products with a reduction over pixels.
 
 use rayon::prelude::*;
 
@@ -13,7 +13,7 @@ use crate::simd::{Leaf, Simd, run};
 pub(crate) struct Outer<'a> {
     pub(crate) a: &'a [f32],
     pub(crate) a_step: usize,
-    /// Columns of `a`: rows of the gradient.
+    /// Columns of `a`, which are the rows of the gradient.
     pub(crate) rows: usize,
     pub(crate) b: &'a [f32],
     pub(crate) b_step: usize,
@@ -22,14 +22,15 @@ pub(crate) struct Outer<'a> {
     pub(crate) pixels: usize,
 }
 
-/// Pixels over which a reduction runs before its block of the gradient is left: both operands stay in a cache.
+/// Pixels that a reduction covers before it moves to another block of the gradient: both operands
+/// stay in a cache.
 const STRETCH: usize = 256;
 
 struct Reduce<'a> {
     outer: Outer<'a>,
     first: usize,
     count: usize,
-    /// Whether the gradient is added to what is there.
+    /// Whether to add to the content of `c`.
     add: bool,
     c: Shared,
     c_step: usize,
@@ -87,10 +88,10 @@ impl Leaf for Reduce<'_> {
     }
 }
 
-/// Rows of a gradient that a task makes.
+/// Rows of a gradient per task.
 const TASK_ROWS: usize = 48;
 
-/// The gradients: one matrix each, `[padded_rows(rows), c_step]`, one after the other.
+/// The gradients, one matrix `[padded_rows(rows), c_step]` after another.
 ///
 /// `a` needs 24 values beyond its last row.
 pub(crate) fn outer(isa: Isa, outers: &[Outer], c_step: usize) -> Scratch {
@@ -111,7 +112,8 @@ pub(crate) fn outer(isa: Isa, outers: &[Outer], c_step: usize) -> Scratch {
         start += size;
     }
     tasks.into_par_iter().for_each(|(outer, first, count, c)| {
-        // SAFETY: tasks write different rows: 48 is a multiple of every block of rows, and the last is padded.
+        // SAFETY: tasks write different rows: 48 is a multiple of the height of every block of
+        // rows, and the last block is padded.
         unsafe {
             run(
                 isa,
@@ -129,10 +131,10 @@ pub(crate) fn outer(isa: Isa, outers: &[Outer], c_step: usize) -> Scratch {
     c
 }
 
-/// Adds a gradient to `c`, `[padded_rows(rows), c_step]`, on this thread.
+/// Adds a gradient to `c`, `[padded_rows(rows), c_step]`, on the calling thread.
 ///
 /// # Panics
-/// Where a slice is shorter than that.
+/// If a slice is shorter.
 pub(crate) fn add_outer(isa: Isa, outer: Outer, c: &mut [f32], c_step: usize) {
     assert!(
         c.len() >= padded_rows(outer.rows) * c_step && c_step >= whole(outer.columns),
@@ -150,24 +152,24 @@ pub(crate) fn add_outer(isa: Isa, outer: Outer, c: &mut [f32], c_step: usize) {
     unsafe { run(isa, leaf) }
 }
 
-/// Rows that a slice has beyond `first`, or a copy with room for whole blocks of them.
-pub(crate) struct Window<'a> {
+/// The rows of a slice from `first` on, copied if the slice has no room for whole blocks of them.
+pub(crate) struct PaddedRows<'a> {
     slice: &'a [f32],
     copy: Option<Scratch>,
 }
 
-impl<'a> Window<'a> {
+impl<'a> PaddedRows<'a> {
     /// `count` rows of `step` values from `first`.
     pub(crate) fn new(map: &'a [f32], step: usize, first: usize, count: usize) -> Self {
         let slice = &map[first * step..];
-        // Rows for a product over them, values for a reduction along them.
+        // Padded rows for a product over them, and extra values for a reduction along them.
         let needed = padded_rows(count) * step + ROW_BLOCK;
         if slice.len() >= needed {
-            return Window { slice, copy: None };
+            return PaddedRows { slice, copy: None };
         }
         let mut copy = Scratch::zeroed(needed);
         copy[..count * step].copy_from_slice(&slice[..count * step]);
-        Window {
+        PaddedRows {
             slice,
             copy: Some(copy),
         }

@@ -1,42 +1,41 @@
-//! Maps that come in bands of rows, from top to bottom, so that no whole one has to be there.
+//! Convolutions on bands of rows, from top to bottom, so that no whole map is in memory.
 //!
-//! A 3x3 convolution needs a row more than it makes on either side. Instead of computing such rows twice, each stage keeps
-//! the few that the next band needs, and lags behind its input by up to a tile. Bands begin at multiples of a tile's rows,
-//! so all bits are those of the whole map.
+//! A 3x3 convolution reads one row more than it writes on either side. It keeps the few rows that
+//! the next band needs, instead of computing them twice, and lags behind its input by up to a tile.
+//! Bands begin at multiples of a tile's rows, so the result has the bits of the whole map.
 
 use std::ops::Range;
 
-use demc_kernels::conv3x3::Ready;
+use demc_kernels::conv3x3::PreparedConvolution;
 use demc_kernels::{Grid, memory};
 use rayon::prelude::*;
 
 /// Rows of the largest tile of a convolution.
 pub(super) const TILE_ROWS: usize = 4;
 
-/// The bands of `height` rows, `band` each but the last.
+/// The bands of `height` rows. All but the last have `band` rows.
 pub(super) fn bands(height: usize, band: usize) -> impl Iterator<Item = Range<usize>> {
     let starts = (0..height).step_by(band);
     starts.map(move |start| start..(start + band).min(height))
 }
 
-/// The rows of one image's map that are there. Memory is held for those alone, so that what waits for its next band is
-/// small.
-pub(super) struct Stream {
+/// Consecutive rows of one image's map. Only these rows are in memory.
+pub(super) struct RowWindow {
     /// Rows of the whole map.
     height: usize,
     width: usize,
     channels: usize,
-    /// The first row that is there.
+    /// The first row in memory.
     first: usize,
-    /// How many are.
+    /// Number of rows in memory.
     rows: usize,
     values: Vec<f32>,
 }
 
-impl Stream {
-    /// None yet.
+impl RowWindow {
+    /// An empty window of a map.
     pub(super) fn new(grid: Grid, channels: usize) -> Self {
-        Stream {
+        RowWindow {
             height: grid.height,
             width: grid.width,
             channels,
@@ -46,23 +45,23 @@ impl Stream {
         }
     }
 
-    /// Back to the top, for the next image.
+    /// Returns to the top, for the next image.
     pub(super) fn restart(&mut self) {
         (self.first, self.rows) = (0, 0);
         self.values = Vec::new();
     }
 
-    /// The row after the last that is there.
+    /// The row after the last one in memory.
     fn end(&self) -> usize {
         self.first + self.rows
     }
 
-    /// The rows that are there.
+    /// The rows in memory.
     pub(super) fn range(&self) -> Range<usize> {
         self.first..self.end()
     }
 
-    /// `rows` more, for the caller to write.
+    /// Appends `rows`, which the caller writes.
     pub(super) fn push(&mut self, rows: usize) -> &mut [f32] {
         let row = self.width * self.channels;
         let held = self.rows * row;
@@ -73,19 +72,19 @@ impl Stream {
         &mut self.values[held..]
     }
 
-    /// The last `rows`.
+    /// The values of the last `rows`.
     pub(super) fn last(&self, rows: usize) -> &[f32] {
         let row = self.width * self.channels;
         &self.values[(self.rows - rows) * row..self.rows * row]
     }
 
-    /// The last `rows`, to be written again.
+    /// The values of the last `rows`, to modify.
     pub(super) fn last_mut(&mut self, rows: usize) -> &mut [f32] {
         let row = self.width * self.channels;
         &mut self.values[(self.rows - rows) * row..self.rows * row]
     }
 
-    /// All that are there, and their grid.
+    /// All rows in memory and their grid.
     pub(super) fn all(&self) -> (Grid, &[f32]) {
         let grid = Grid {
             batch: 1,
@@ -95,44 +94,48 @@ impl Stream {
         (grid, self.last(self.rows))
     }
 
-    /// Forgets the rows above `row`.
-    pub(super) fn forget_above(&mut self, row: usize) {
-        let gone = row.clamp(self.first, self.end()) - self.first;
-        if gone == 0 {
+    /// Frees the rows above `row`.
+    pub(super) fn free_above(&mut self, row: usize) {
+        let freed = row.clamp(self.first, self.end()) - self.first;
+        if freed == 0 {
             return;
         }
-        let rest = &self.values[gone * self.width * self.channels..];
+        let rest = &self.values[freed * self.width * self.channels..];
         let mut values = memory::buffer(rest.len());
         copy(rest, &mut values);
         self.values = values;
-        (self.first, self.rows) = (self.first + gone, self.rows - gone);
+        (self.first, self.rows) = (self.first + freed, self.rows - freed);
     }
 
-    /// Forgets all rows.
-    pub(super) fn forget(&mut self) {
-        self.forget_above(self.end());
+    /// Frees all rows.
+    pub(super) fn free_all(&mut self) {
+        self.free_above(self.end());
     }
 }
 
-/// Values that a thread copies at a time.
-const PIECE: usize = 1 << 16;
+/// Number of values that a thread copies at a time.
+const COPY_LENGTH: usize = 1 << 16;
 
-fn copy(from: &[f32], to: &mut [f32]) {
-    let pieces = to.par_chunks_mut(PIECE).zip(from.par_chunks(PIECE));
-    pieces.for_each(|(to, from)| to.copy_from_slice(from));
+fn copy(source: &[f32], target: &mut [f32]) {
+    let pieces = target.par_chunks_mut(COPY_LENGTH);
+    pieces
+        .zip(source.par_chunks(COPY_LENGTH))
+        .for_each(|(target, source)| target.copy_from_slice(source));
 }
 
-/// A convolution and the rows that it reads.
-pub(super) struct Stage<'a> {
-    pub(super) conv: Ready<'a>,
-    pub(super) input: Stream,
-    /// Rows that it has made.
+/// A convolution and the input rows that it still needs.
+pub(super) struct BandedConv<'a> {
+    conv: PreparedConvolution<'a>,
+    input: RowWindow,
+    /// Number of rows computed so far.
     made: usize,
 }
 
-impl<'a> Stage<'a> {
-    pub(super) fn new(conv: Ready<'a>, input: Stream) -> Self {
-        Stage {
+impl<'a> BandedConv<'a> {
+    /// A convolution of a map on `grid`.
+    pub(super) fn new(conv: PreparedConvolution<'a>, grid: Grid) -> Self {
+        let input = RowWindow::new(grid, conv.inputs());
+        BandedConv {
             conv,
             input,
             made: 0,
@@ -144,7 +147,7 @@ impl<'a> Stage<'a> {
         self.made = 0;
     }
 
-    /// The rows that it can make now, whole tiles of them until the last.
+    /// The rows that can be computed now: whole tiles, except at the end of the map.
     fn pending(&self) -> Range<usize> {
         let end = match self.input.end() {
             end if end == self.input.height => end,
@@ -153,47 +156,47 @@ impl<'a> Stage<'a> {
         self.made..end.max(self.made)
     }
 
-    /// Makes them, and keeps the rows that the next ones need.
-    fn make(&mut self, rows: &Range<usize>, y: &mut [f32]) {
+    /// Computes `rows` and keeps the input rows that the next ones need.
+    fn compute(&mut self, rows: &Range<usize>, y: &mut [f32]) {
         let (grid, x) = self.input.all();
         self.conv.forward(grid, x, rows.start - self.input.first, y);
         self.made = rows.end;
-        self.input.forget_above(rows.end.saturating_sub(1));
+        self.input.free_above(rows.end.saturating_sub(1));
     }
 }
 
-/// Convolutions one after another.
-pub(super) struct Chain<'a> {
-    pub(super) stages: Vec<Stage<'a>>,
-    /// What the last one made.
-    pub(super) output: Stream,
+/// A sequence of convolutions.
+pub(super) struct ConvChain<'a> {
+    pub(super) convs: Vec<BandedConv<'a>>,
+    /// The rows of the last convolution's output.
+    pub(super) output: RowWindow,
 }
 
-impl Chain<'_> {
-    /// Back to the top, for the next image.
+impl ConvChain<'_> {
+    /// Returns to the top, for the next image.
     pub(super) fn restart(&mut self) {
-        self.stages.iter_mut().for_each(Stage::restart);
+        self.convs.iter_mut().for_each(BandedConv::restart);
         self.output.restart();
     }
 
-    /// Where the first convolution's input comes in.
-    pub(super) fn input(&mut self) -> &mut Stream {
-        let first = self.stages.first_mut();
+    /// The input rows of the first convolution.
+    pub(super) fn input(&mut self) -> &mut RowWindow {
+        let first = self.convs.first_mut();
         &mut first.expect("a chain of at least one convolution").input
     }
 
-    /// Makes all that can be made of the rows that have come in. `see` is shown what each stage has made: the stage's
-    /// index, the rows and their values.
-    pub(super) fn advance(&mut self, mut see: impl FnMut(usize, Range<usize>, &[f32])) {
-        for index in 0..self.stages.len() {
-            let (stages, next) = self.stages.split_at_mut(index + 1);
+    /// Computes all rows that the input allows. `observe` receives each convolution's index, the
+    /// rows that it has computed, and their values.
+    pub(super) fn advance(&mut self, mut observe: impl FnMut(usize, Range<usize>, &[f32])) {
+        for index in 0..self.convs.len() {
+            let (convs, next) = self.convs.split_at_mut(index + 1);
             let next = next
                 .first_mut()
-                .map_or(&mut self.output, |stage| &mut stage.input);
-            let rows = stages[index].pending();
+                .map_or(&mut self.output, |conv| &mut conv.input);
+            let rows = convs[index].pending();
             if !rows.is_empty() {
-                stages[index].make(&rows, next.push(rows.len()));
-                see(index, rows.clone(), next.last(rows.len()));
+                convs[index].compute(&rows, next.push(rows.len()));
+                observe(index, rows.clone(), next.last(rows.len()));
             }
         }
     }

@@ -1,43 +1,53 @@
-//! The decoder: each level in place of the skips' share of its fusion, of large ones only a band not yet fused. The last
-//! level of a large image is `step`'s.
+//! The decoder's levels. Each output replaces the skips' share of the level's fusion; large maps
+//! are computed in bands. `full_resolution` computes the last level of a large image.
 
 use std::ops::Range;
 
-use demc_kernels::conv1x1::{self, Finish};
-use demc_kernels::{Grid, Isa, deconv4x4, memory};
+use demc_kernels::conv1x1::{self, Epilogue};
+use demc_kernels::deconv4x4::PreparedDeconvolution;
+use demc_kernels::{Grid, Isa, memory};
 
 use super::band::bands;
-use super::layer::Layer;
-use super::{Maps, Run};
+use super::folded::FoldedConv;
+use super::{FeatureMaps, InferencePass};
 use crate::decoder::DecoderLevel;
 
-impl Run<'_> {
-    /// A level: `sum` is the skips' share of its fusion and becomes its output.
-    pub(super) fn ascend(&self, level: &DecoderLevel, below: &Maps, mut sum: Maps) -> Maps {
-        let layers = level_layers(level);
-        let ascent = self.ascent(level, &layers);
+impl InferencePass<'_> {
+    /// The output of a level. `sum` is the skips' share of its fusion.
+    pub(super) fn decode_level(
+        &self,
+        level: &DecoderLevel,
+        below: &FeatureMaps,
+        mut sum: FeatureMaps,
+    ) -> FeatureMaps {
+        let convs = folded_level(level);
+        let prepared = self.prepare_level(level, &convs);
         let grid = sum.grid;
         if !self.plan.is_banded(grid) {
-            ascent.finish(below.grid, &below.values, 0, &mut sum.values);
+            prepared.fuse(below.grid, &below.values, 0, &mut sum.values);
             return sum;
         }
         for image in 0..grid.batch {
             for rows in bands(grid.height, self.plan.band) {
-                ascent.finish_rows(below, image, rows.clone(), sum.rows_mut(image, rows));
+                prepared.fuse_rows(below, image, rows.clone(), sum.rows_mut(image, rows));
             }
         }
         sum
     }
 
-    /// A level's `layers`, ready.
-    pub(super) fn ascent<'a>(&self, level: &DecoderLevel, layers: &'a [Layer; 2]) -> Ascent<'a> {
-        let [deconv, fuse] = layers;
-        Ascent {
+    /// The level with its prepared weights; `convs` are those of [`folded_level`].
+    pub(super) fn prepare_level<'a>(
+        &self,
+        level: &DecoderLevel,
+        convs: &'a [FoldedConv; 2],
+    ) -> PreparedLevel<'a> {
+        let [deconv, fusion] = convs;
+        PreparedLevel {
             isa: self.isa,
-            deconv: deconv4x4::Ready::new(self.isa, deconv.weight(), deconv.bias(), true),
-            fuse,
-            finish: Finish {
-                bias: Some(fuse.bias()),
+            deconv: PreparedDeconvolution::new(self.isa, deconv.weight(), deconv.bias(), true),
+            fusion,
+            epilogue: Epilogue {
+                bias: Some(fusion.bias()),
                 relu: level.activated_fusion,
                 add: true,
             },
@@ -45,46 +55,54 @@ impl Run<'_> {
     }
 }
 
-/// Deconvolution and skip fusion.
-pub(super) fn level_layers(level: &DecoderLevel) -> [Layer; 2] {
+/// The deconvolution and the skip fusion of a level.
+pub(super) fn folded_level(level: &DecoderLevel) -> [FoldedConv; 2] {
     [
-        Layer::deconv(&level.deconv, level.norm.as_ref()),
-        Layer::conv(&level.fuse, None),
+        FoldedConv::deconv(&level.deconv, level.norm.as_ref()),
+        FoldedConv::conv(&level.fuse, None),
     ]
 }
 
-/// A level of the decoder, ready for what the encoders gave to its fusion.
-pub(super) struct Ascent<'a> {
+/// A level of the decoder with prepared weights.
+pub(super) struct PreparedLevel<'a> {
     isa: Isa,
-    deconv: deconv4x4::Ready<'a>,
-    fuse: &'a Layer,
-    finish: Finish<'a>,
+    deconv: PreparedDeconvolution<'a>,
+    fusion: &'a FoldedConv,
+    epilogue: Epilogue<'a>,
 }
 
-impl Ascent<'_> {
-    /// Adds the decoder's share of the fusion to that of the skips in `sum`, rows of an image that begin and end with a
-    /// pair, and finishes them.
-    pub(super) fn finish_rows(
+impl PreparedLevel<'_> {
+    /// Completes the fusion of some rows of an image: adds the decoder's share to that of the skips
+    /// in `sum`. The rows begin and end at even numbers.
+    pub(super) fn fuse_rows(
         &self,
-        below: &Maps,
+        below: &FeatureMaps,
         image: usize,
         rows: Range<usize>,
         sum: &mut [f32],
     ) {
         let (window, above) = below.with_neighbours(rows.start / 2..rows.end / 2);
         let x = below.rows(image, window.clone());
-        self.finish(below.band(window.len()), x, above, sum);
+        self.fuse(below.band(window.len()), x, above, sum);
     }
 
-    /// The same of the rows of `x` from `above` on, as many as `sum` has pairs.
-    fn finish(&self, grid: Grid, x: &[f32], above: usize, sum: &mut [f32]) {
+    /// The same for the rows of `x` from `above` on; `sum` has two rows for each.
+    fn fuse(&self, grid: Grid, x: &[f32], above: usize, sum: &mut [f32]) {
         let mut decoded = memory::buffer(sum.len());
         self.deconv.forward(grid, x, above, &mut decoded);
-        let made = Grid {
-            height: sum.len() / (grid.batch * 2 * grid.width * self.fuse.outputs()),
+        let decoded_grid = Grid {
+            height: sum.len() / (grid.batch * 2 * grid.width * self.fusion.outputs()),
             ..grid.doubled()
         };
-        let (weight, finish) = (self.fuse.weight(), self.finish);
-        conv1x1::part(self.isa, made, &[&decoded], weight, 0, finish, sum);
+        let (weight, epilogue) = (self.fusion.weight(), self.epilogue);
+        conv1x1::part(
+            self.isa,
+            decoded_grid,
+            &[&decoded],
+            weight,
+            0,
+            epilogue,
+            sum,
+        );
     }
 }

@@ -1,31 +1,32 @@
-//! The encoders, level by level: whole maps, or bands of them.
+//! The encoders, level by level, on whole maps or on bands.
 
 use std::ops::Range;
 
-use demc_kernels::conv1x1::{self, Finish};
-use demc_kernels::conv3x3::Ready;
+use demc_kernels::conv1x1::{self, Epilogue};
+use demc_kernels::conv3x3::PreparedConvolution;
 use demc_kernels::{Grid, pool};
 
-use super::band::{Chain, Stage, Stream, bands};
-use super::images::Images;
-use super::layer::Layer;
-use super::{Maps, Run};
+use super::band::{BandedConv, ConvChain, RowWindow, bands};
+use super::folded::FoldedConv;
+use super::images::InputImages;
+use super::{FeatureMaps, InferencePass};
 use crate::config::{Input, LEVELS};
 use crate::encoder::EncoderLevel;
 use crate::fusion::Fusion;
 use crate::layers::ConvBlock;
 
-/// Deepest level that is computed in bands; below it, a map is smaller than the ready weights of its convolutions.
+/// Deepest level that is computed in bands. Below it, a map is smaller than the prepared weights of
+/// its convolutions.
 pub(super) const DEEPEST_BANDED: usize = 2;
 
-impl Run<'_> {
-    /// What the encoders eat, at once.
-    pub(super) fn inputs(&self, images: Images) -> Vec<Maps> {
+impl InferencePass<'_> {
+    /// The inputs of all encoders, as whole maps.
+    pub(super) fn encoder_inputs(&self, images: InputImages) -> Vec<FeatureMaps> {
         let spec = self.model.config().variant.spec();
         let detail = spec.has_fusion().then(|| {
             let features = images.interleaved(&[Input::Features], None);
             let blocks = self.fusion().blocks.iter();
-            blocks.fold(features, |x, block| self.conv3x3(&x, &block_layer(block)))
+            blocks.fold(features, |x, block| self.conv3x3(&x, &folded_block(block)))
         });
         let parts = spec.encoders.iter();
         parts
@@ -33,28 +34,28 @@ impl Run<'_> {
             .collect()
     }
 
-    pub(super) fn fusion(&self) -> &Fusion {
+    fn fusion(&self) -> &Fusion {
         let fusion = self.model.fusion.as_ref();
-        fusion.expect("a variant whose encoder eats the detail map has a fusion")
+        fusion.expect("a variant with a detail map has a fusion")
     }
 
-    /// Takes all encoders down a level, whole maps at a time: their inputs become those of the level below. Returns the
-    /// skips' share of the level's fusion.
-    pub(super) fn descend(&self, level: usize, inputs: &mut Vec<Maps>) -> Maps {
+    /// Computes a level of all encoders on whole maps: `inputs` become those of the level below.
+    /// Returns the skips' share of the level's fusion.
+    pub(super) fn encode_level(&self, level: usize, inputs: &mut Vec<FeatureMaps>) -> FeatureMaps {
         let grid = inputs[0].grid;
-        let fuse = self.fuse(level);
-        let mut sum = Maps::new(grid, fuse.outputs());
+        let fusion = self.skip_fusion(level);
+        let mut sum = FeatureMaps::new(grid, fusion.outputs());
         for (index, input) in std::mem::take(inputs).into_iter().enumerate() {
             let level = &self.model.encoders[index].levels[level];
             let mut x = input;
-            for (made, conv) in level.convs.iter().enumerate() {
-                x = self.conv3x3(&x, &Layer::conv(conv, None));
-                if made + 1 == level.skip_after {
-                    self.add_skip(index, grid, &x.values, &fuse, &mut sum.values);
+            for (number, conv) in level.convs.iter().enumerate() {
+                x = self.conv3x3(&x, &FoldedConv::conv(conv, None));
+                if number + 1 == level.skip_after {
+                    self.add_skip(index, grid, &x.values, &fusion, &mut sum.values);
                 }
             }
             if level.pooled {
-                let mut below = Maps::new(grid.halved(), x.channels());
+                let mut below = FeatureMaps::new(grid.halved(), x.channels());
                 pool::forward(self.isa, grid, &x.values, &mut below.values);
                 inputs.push(below);
             }
@@ -62,41 +63,55 @@ impl Run<'_> {
         sum
     }
 
-    /// Adds an encoder's skip, times its part of a fusion, to what those before it gave.
+    /// Adds an encoder's share of a fusion to `sum`, which holds the shares of the encoders before
+    /// it.
     pub(super) fn add_skip(
         &self,
         encoder: usize,
         grid: Grid,
         skip: &[f32],
-        fuse: &Layer,
+        fusion: &FoldedConv,
         sum: &mut [f32],
     ) {
-        let first = (1 + encoder) * fuse.outputs();
-        let finish = Finish {
+        // The decoder's channels are the first inputs of the fusion.
+        let first = (1 + encoder) * fusion.outputs();
+        let epilogue = Epilogue {
             add: encoder > 0,
-            ..Finish::default()
+            ..Epilogue::default()
         };
-        conv1x1::part(self.isa, grid, &[skip], fuse.weight(), first, finish, sum);
+        conv1x1::part(
+            self.isa,
+            grid,
+            &[skip],
+            fusion.weight(),
+            first,
+            epilogue,
+            sum,
+        );
     }
 
-    /// The same in bands, encoder by encoder.
-    pub(super) fn descend_in_bands(&self, level: usize, inputs: &mut Vec<Maps>) -> Maps {
+    /// The same on bands, encoder by encoder.
+    pub(super) fn encode_level_in_bands(
+        &self,
+        level: usize,
+        inputs: &mut Vec<FeatureMaps>,
+    ) -> FeatureMaps {
         let grid = inputs[0].grid;
-        let fuse = self.fuse(level);
-        let mut sum = Maps::new(grid, fuse.outputs());
+        let fusion = self.skip_fusion(level);
+        let mut sum = FeatureMaps::new(grid, fusion.outputs());
         let mut below = Vec::with_capacity(inputs.len());
         for (index, input) in std::mem::take(inputs).into_iter().enumerate() {
-            let layers = self.layers(index, level..level + 1);
-            let mut levels = self.levels(index, level..level + 1, grid, &layers);
-            let mut pooled = self.below(index, level, grid);
+            let convs = self.folded_levels(index, level..level + 1);
+            let mut levels = self.banded_levels(index, level..level + 1, grid, &convs);
+            let mut pooled = self.pooled_map(index, level, grid);
             for image in 0..grid.batch {
                 levels.iter_mut().for_each(|level| level.chain.restart());
                 for rows in bands(grid.height, self.plan.band) {
-                    let push = levels[0].chain.input().push(rows.len());
-                    push.copy_from_slice(input.rows(image, rows));
-                    self.flow(&mut levels, image, pooled.as_mut(), |_, rows, skip| {
+                    let target = levels[0].chain.input().push(rows.len());
+                    target.copy_from_slice(input.rows(image, rows));
+                    self.advance(&mut levels, image, pooled.as_mut(), |_, rows, skip| {
                         let band = sum.band(rows.len());
-                        self.add_skip(index, band, skip, &fuse, sum.rows_mut(image, rows));
+                        self.add_skip(index, band, skip, &fusion, sum.rows_mut(image, rows));
                     });
                 }
             }
@@ -106,24 +121,25 @@ impl Run<'_> {
         sum
     }
 
-    /// Lets the rows that have come into the first of `levels` flow through all of them: the pooled rows of the last one
-    /// into `below`, each level's skip to `see`, with the level's index and the rows.
-    pub(super) fn flow(
+    /// Computes all rows of `levels` that the input of the first one allows. The pooled rows of the
+    /// last level go into `below`. `observe` receives each level's index, the rows of its skip, and
+    /// their values.
+    pub(super) fn advance(
         &self,
-        levels: &mut [Level],
+        levels: &mut [BandedLevel],
         image: usize,
-        mut below: Option<&mut Maps>,
-        mut see: impl FnMut(usize, Range<usize>, &[f32]),
+        mut below: Option<&mut FeatureMaps>,
+        mut observe: impl FnMut(usize, Range<usize>, &[f32]),
     ) {
         for index in 0..levels.len() {
             let (upper, lower) = levels.split_at_mut(index + 1);
-            let Level { chain, skip_after } = &mut upper[index];
-            chain.advance(|stage, rows, values| {
-                if stage + 1 == *skip_after {
-                    see(index, rows, values);
+            let BandedLevel { chain, skip_after } = &mut upper[index];
+            chain.advance(|conv, rows, values| {
+                if conv + 1 == *skip_after {
+                    observe(index, rows, values);
                 }
             });
-            let (grid, made) = chain.output.all();
+            let (grid, output) = chain.output.all();
             let range = chain.output.range();
             let pooled = match (lower.first_mut(), &mut below) {
                 _ if range.is_empty() => None,
@@ -133,82 +149,92 @@ impl Run<'_> {
                 (None, None) => None,
             };
             if let Some(pooled) = pooled {
-                pool::forward(self.isa, grid, made, pooled);
+                pool::forward(self.isa, grid, output, pooled);
             }
-            chain.output.forget();
+            chain.output.free_all();
         }
     }
 
     /// The convolutions of some levels of an encoder.
-    pub(super) fn layers(&self, encoder: usize, levels: Range<usize>) -> Vec<Vec<Layer>> {
+    pub(super) fn folded_levels(
+        &self,
+        encoder: usize,
+        levels: Range<usize>,
+    ) -> Vec<Vec<FoldedConv>> {
         let levels = &self.model.encoders[encoder].levels[levels];
         levels
             .iter()
             .map(|level| {
                 let convs = level.convs.iter();
-                convs.map(|conv| Layer::conv(conv, None)).collect()
+                convs.map(|conv| FoldedConv::conv(conv, None)).collect()
             })
             .collect()
     }
 
-    /// Some levels of an encoder, ready for bands of a first level's `grid`.
-    pub(super) fn levels<'a>(
+    /// Some levels of an encoder for bands of maps, the first level on `grid`. `convs` are those of
+    /// [`Self::folded_levels`].
+    pub(super) fn banded_levels<'a>(
         &self,
         encoder: usize,
         levels: Range<usize>,
         grid: Grid,
-        layers: &'a [Vec<Layer>],
-    ) -> Vec<Level<'a>> {
-        let specs: &[EncoderLevel] = &self.model.encoders[encoder].levels[levels];
+        convs: &'a [Vec<FoldedConv>],
+    ) -> Vec<BandedLevel<'a>> {
+        let modules: &[EncoderLevel] = &self.model.encoders[encoder].levels[levels];
         let mut grid = grid;
-        let mut ready = Vec::with_capacity(layers.len());
-        for (spec, layers) in specs.iter().zip(layers) {
-            ready.push(Level {
-                chain: self.chain(layers, grid),
-                skip_after: spec.skip_after,
+        let mut banded = Vec::with_capacity(convs.len());
+        for (module, convs) in modules.iter().zip(convs) {
+            banded.push(BandedLevel {
+                chain: self.chain(convs, grid),
+                skip_after: module.skip_after,
             });
             grid = grid.halved();
         }
-        ready
+        banded
     }
 
-    /// The pooled map below a level, where the encoder computes it.
-    pub(super) fn below(&self, encoder: usize, level: usize, grid: Grid) -> Option<Maps> {
-        let spec = &self.model.encoders[encoder].levels[level];
+    /// The map below a level on `grid`, to be written, if the encoder computes it.
+    pub(super) fn pooled_map(
+        &self,
+        encoder: usize,
+        level: usize,
+        grid: Grid,
+    ) -> Option<FeatureMaps> {
+        let module = &self.model.encoders[encoder].levels[level];
         let channels = self.model.config().level_channels()[level];
-        spec.pooled.then(|| Maps::new(grid.halved(), channels))
+        module
+            .pooled
+            .then(|| FeatureMaps::new(grid.halved(), channels))
     }
 
-    /// The convolutions of these layers for bands of an image on `grid`, each with its ReLU.
-    pub(super) fn chain<'a>(&self, layers: &'a [Layer], grid: Grid) -> Chain<'a> {
-        let stages: Vec<Stage> = layers
-            .iter()
-            .map(|layer| {
-                let conv = Ready::new(self.isa, self.tile, layer.weight(), layer.bias(), true);
-                let inputs = conv.inputs();
-                Stage::new(conv, Stream::new(grid, inputs))
-            })
-            .collect();
-        let outputs = layers.last().map_or(0, Layer::outputs);
-        Chain {
-            stages,
-            output: Stream::new(grid, outputs),
+    /// A chain of convolutions, each with a ReLU, for bands of an image on `grid`.
+    pub(super) fn chain<'a>(&self, convs: &'a [FoldedConv], grid: Grid) -> ConvChain<'a> {
+        let (isa, tile) = (self.isa, self.tile);
+        let banded = convs.iter().map(|conv| {
+            let prepared = PreparedConvolution::new(isa, tile, conv.weight(), conv.bias(), true);
+            BandedConv::new(prepared, grid)
+        });
+        let outputs = convs.last().map_or(0, FoldedConv::outputs);
+        ConvChain {
+            convs: banded.collect(),
+            output: RowWindow::new(grid, outputs),
         }
     }
 
     /// The skip fusion of a level, counted from the full resolution down.
-    pub(super) fn fuse(&self, level: usize) -> Layer {
-        Layer::conv(&self.model.decoder.levels[LEVELS - 1 - level].fuse, None)
+    pub(super) fn skip_fusion(&self, level: usize) -> FoldedConv {
+        FoldedConv::conv(&self.model.decoder.levels[LEVELS - 1 - level].fuse, None)
     }
 }
 
-/// A level of an encoder in bands.
-pub(super) struct Level<'a> {
-    pub(super) chain: Chain<'a>,
-    /// After how many of its convolutions the skip is taken.
+/// A level of an encoder for bands of maps.
+pub(super) struct BandedLevel<'a> {
+    pub(super) chain: ConvChain<'a>,
+    /// Number of convolutions before the skip.
     skip_after: usize,
 }
 
-pub(super) fn block_layer(block: &ConvBlock) -> Layer {
-    Layer::conv(&block.conv, block.norm.as_ref())
+/// The convolution of a block with its normalisation folded in.
+pub(super) fn folded_block(block: &ConvBlock) -> FoldedConv {
+    FoldedConv::conv(&block.conv, block.norm.as_ref())
 }

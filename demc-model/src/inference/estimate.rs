@@ -1,63 +1,88 @@
-//! How much memory a pass takes, told before it runs.
+//! The memory of a pass, known before it runs.
 
 use demc_kernels::{Grid, memory};
 
-use super::Plan;
+use super::BandPlan;
 use super::encoder::DEEPEST_BANDED;
-use super::step::LEVELS_IN_STEP;
+use super::full_resolution::UPPER_LEVELS;
 use crate::config::{
-    COLOR_CHANNELS, DETAIL_CHANNELS, FEATURE_CHANNELS, Input, LEVELS, ModelConfig,
+    COLOR_CHANNELS, DETAIL_CHANNELS, FEATURE_CHANNELS, Input, LEVELS, ModelConfig, channels_of,
 };
+use crate::ops::Ops;
 
-/// Bytes of a value.
+/// Bytes per value.
 const VALUE: usize = size_of::<f32>();
 
-/// Places of a Winograd tile, F(4x4, 3x3).
-const PLACES: usize = 36;
+/// Values of a transformed Winograd tile, F(4x4, 3x3).
+const TILE_VALUES: usize = 36;
 
-/// Pixels that it makes.
+/// Output pixels of a tile.
 const TILE_PIXELS: usize = 16;
 
-/// Most tiles that a thread transforms at a time where weights are large, which is where that is much memory.
+/// Largest number of tiles that a thread transforms at a time where weights, and so this memory,
+/// are large.
 const TILES: usize = 96;
 
-/// Rows that wait for a next band, and that the last band of a chain brings beside its own.
+/// Rows that a convolution keeps for the next band, and that the last band of a chain has beside
+/// its own.
 const WAITING_ROWS: usize = 5;
 
-/// The most bytes that denoising one image of `height` x `width` pixels takes where the kernels run, beside the network's
-/// weights: the planar input and output, and all that [`Denoiser::forward`](crate::Denoiser::forward) holds at a time.
+/// Values that Burn's operations hold at a time per value of the largest map. Measured: 7 to 8 on
+/// `flex` with width 16, the paper's levels and images from 256x256 to 1280x720.
+const BURN_VALUES: u64 = 10;
+
+/// Bytes that a pass of `ops` over one image of `height` x `width` pixels takes, without the
+/// network's weights. Both sides are multiples of 32.
+pub fn pass_bytes(ops: Ops, config: &ModelConfig, height: usize, width: usize) -> u64 {
+    if ops.has_fast_inference() {
+        return peak_bytes(config, height, width);
+    }
+    // The largest map is the fusion sub-network's or a level's; each level has a quarter of the
+    // pixels.
+    let levels = config.level_channels().into_iter().enumerate();
+    let maps = levels.map(|(level, channels)| (channels * height * width) >> (2 * level));
+    let largest = maps.fold(config.width * height * width, usize::max);
+    BURN_VALUES * (largest * VALUE) as u64
+}
+
+/// Peak memory in bytes of a pass of the kernels over one image of `height` x `width` pixels. Both
+/// sides are multiples of 32.
 ///
-/// The pass is a sequence of phases; each holds some maps, the prepared weights of some convolutions and what threads
-/// work in, and the largest counts. With `P` pixels, base width `C` and large images nearly all of it are the skips'
-/// shares of the fusions, `C * P * (1/2 + 1/4 + 1/8 + 1/32)` values, and the images, `6 * P` to `18 * P`. It grows a
-/// little with the number of threads, whose bands are larger.
-/// Both sides are multiples of 32.
+/// It counts the planar input and output and the working memory of
+/// [`Denoiser::forward`](crate::Denoiser::forward), but not the network's weights.
+///
+/// The pass is a sequence of phases. Each holds some maps, the prepared weights of some
+/// convolutions and the working memory of the threads; the largest phase counts. A large image with
+/// `P` pixels and base width `C` mostly needs the skips' shares of the fusions,
+/// `C * P * (1/2 + 1/4 + 1/8 + 1/32)` values, and the images, `6 * P` to `18 * P` values. Bands,
+/// and so the result, grow a little with the number of threads.
 pub fn peak_bytes(config: &ModelConfig, height: usize, width: usize) -> u64 {
-    let plan = Plan::new(width);
+    let plan = BandPlan::new(width);
     let grid = Grid {
         batch: 1,
         height,
         width,
     };
-    let pass = Pass { config, plan, grid };
-    let values = pass.encoders().max(pass.decoder());
+    let estimate = PeakEstimate { config, plan, grid };
+    let values = estimate.encoders().max(estimate.decoder());
     (values * VALUE) as u64
 }
 
-/// Bytes that this process holds, does not use, and will use for its next images before it asks the system for more.
+/// Bytes that this process holds unused. The next images use them before it asks the system for
+/// more.
 pub fn reusable_bytes() -> u64 {
     memory::kept_bytes() as u64
 }
 
-/// A pass through the network; all sizes in values.
-struct Pass<'a> {
+/// The sizes of a pass through the network, in values.
+struct PeakEstimate<'a> {
     config: &'a ModelConfig,
-    plan: Plan,
-    /// The image's.
+    plan: BandPlan,
+    /// The image.
     grid: Grid,
 }
 
-impl Pass<'_> {
+impl PeakEstimate<'_> {
     fn grid_of(&self, level: usize) -> Grid {
         (0..level).fold(self.grid, |grid, _| grid.halved())
     }
@@ -66,12 +91,12 @@ impl Pass<'_> {
         self.config.level_channels()[level]
     }
 
-    /// The map of a level, its input or one of its convolutions.
+    /// The output of a convolution of a level.
     fn map(&self, level: usize) -> usize {
         self.grid_of(level).pixels() * self.channels(level)
     }
 
-    /// A level's input.
+    /// The input of a level.
     fn input(&self, level: usize) -> usize {
         match level {
             0 => self.grid.pixels() * self.first_input(),
@@ -82,7 +107,7 @@ impl Pass<'_> {
     /// Channels of the widest encoder's input.
     fn first_input(&self) -> usize {
         let inputs = self.config.variant.spec().encoders.iter();
-        let channels = inputs.map(|parts| parts.iter().map(|part| part.channels()).sum());
+        let channels = inputs.map(|inputs| channels_of(inputs));
         channels.max().unwrap_or(COLOR_CHANNELS)
     }
 
@@ -99,7 +124,7 @@ impl Pass<'_> {
         self.config.variant.spec().has_fusion()
     }
 
-    /// The detail map, where there is one.
+    /// The detail map, if there is one.
     fn detail(&self) -> usize {
         match self.has_fusion() {
             true => self.grid.pixels() * DETAIL_CHANNELS,
@@ -107,8 +132,8 @@ impl Pass<'_> {
         }
     }
 
-    /// What the first level's skips are computed from once more.
-    fn kept(&self) -> usize {
+    /// The inputs from which the first level's skips are recomputed.
+    fn skip_sources(&self) -> usize {
         if !self.plan.is_banded(self.grid) {
             return 0;
         }
@@ -122,37 +147,41 @@ impl Pass<'_> {
         images + self.detail()
     }
 
-    /// The shares of some levels' fusions; the first level's is not kept of a large image.
+    /// The skips' shares of some levels' fusions. For a large image the first level's share is not
+    /// kept.
     fn sums(&self, levels: std::ops::Range<usize>) -> usize {
         let first = usize::from(self.plan.is_banded(self.grid));
         let levels = levels.filter(|level| *level >= first);
         levels.map(|level| self.map(level)).sum()
     }
 
-    /// What threads work in at a convolution of `pixels`.
+    /// Working memory of the threads during a convolution with `pixels`.
     fn scratch(&self, inputs: usize, outputs: usize, pixels: usize) -> usize {
         let tiles = (pixels / TILE_PIXELS).min(self.plan.threads * TILES);
-        // Narrow ones work in less than a cache.
-        match inputs * outputs * PLACES > 512 << 10 {
-            true => PLACES * (inputs + outputs) * tiles,
+        // Narrow convolutions need less than a cache.
+        match inputs * outputs * TILE_VALUES > 512 << 10 {
+            true => TILE_VALUES * (inputs + outputs) * tiles,
             false => 0,
         }
     }
 
-    /// The prepared weights of a level's convolutions: all, or the largest.
-    fn weights(&self, level: usize, all: bool) -> usize {
-        let (from, to) = match level {
+    /// The prepared weights of all convolutions of a level. The few input channels of the first do
+    /// not count.
+    fn all_weights(&self, level: usize) -> usize {
+        let (inputs, outputs) = match level {
             0 => (0, self.channels(0)),
             _ => (self.channels(level - 1), self.channels(level)),
         };
         let others = self.config.reading.spec().convolutions[level] - 1;
-        match all {
-            true => PLACES * to * (from + others * to),
-            false => PLACES * to * to,
-        }
+        TILE_VALUES * outputs * (inputs + others * outputs)
     }
 
-    /// Rows of a level of an image that a chain of convolutions holds while a band runs through.
+    /// The prepared weights of the largest convolution of a level.
+    fn largest_weights(&self, level: usize) -> usize {
+        TILE_VALUES * self.channels(level) * self.channels(level)
+    }
+
+    /// Rows of a map of a level.
     fn rows(&self, level: usize, rows: usize) -> usize {
         let Grid { height, width, .. } = self.grid_of(level);
         rows.min(height) * width * self.channels(level)
@@ -161,39 +190,38 @@ impl Pass<'_> {
     fn encoders(&self) -> usize {
         let count = self.encoder_count();
         let banded = |level| self.plan.is_banded(self.grid_of(level));
-        let in_step = banded(0);
-        let (first, mut most) = if in_step {
-            let waiting: usize = (0..LEVELS_IN_STEP)
+        let (first, mut most) = if banded(0) {
+            let waiting: usize = (0..UPPER_LEVELS)
                 .map(|level| {
                     let convolutions = self.config.reading.spec().convolutions[level];
-                    self.rows(level, WAITING_ROWS) * (convolutions - 1) + self.weights(level, true)
+                    self.rows(level, WAITING_ROWS) * (convolutions - 1) + self.all_weights(level)
                 })
                 .sum();
-            let below = self.input(LEVELS_IN_STEP);
-            // A band in and out of a convolution.
+            let below = self.input(UPPER_LEVELS);
+            // The band before and after a convolution.
             let bands = 2 * self.rows(0, self.plan.band + 2 * WAITING_ROWS);
-            let sums = self.sums(1..LEVELS_IN_STEP);
+            let sums = self.sums(1..UPPER_LEVELS);
             let held = self.images() + self.detail() + sums + bands;
-            (LEVELS_IN_STEP, held + count * (waiting + below))
+            (UPPER_LEVELS, held + count * (waiting + below))
         } else if self.has_fusion() {
-            let fusion = 2 * self.map(0) + self.weights(0, false);
+            let fusion = 2 * self.map(0) + self.largest_weights(0);
             (0, self.images() + fusion)
         } else {
             (0, self.images() + count * self.input(0))
         };
         for level in first..LEVELS {
-            let held = self.kept() + self.sums(0..level + 1) + count * self.input(level);
+            let held = self.skip_sources() + self.sums(0..level + 1) + count * self.input(level);
             let grid = self.grid_of(level);
-            let works = if level <= DEEPEST_BANDED && banded(level) {
+            let working = if level <= DEEPEST_BANDED && banded(level) {
                 let bands = 3 * self.rows(level, self.plan.band + 2 * WAITING_ROWS);
-                self.weights(level, true) + bands + self.input(level + 1)
+                self.all_weights(level) + bands + self.input(level + 1)
             } else {
-                let to = self.channels(level);
-                let scratch = self.scratch(to, to, grid.pixels());
-                // The input of the encoder at work goes with its first convolution.
-                2 * self.map(level) - self.input(level) + self.weights(level, false) + scratch
+                let channels = self.channels(level);
+                let scratch = self.scratch(channels, channels, grid.pixels());
+                // The input of the current encoder is freed after its first convolution.
+                2 * self.map(level) - self.input(level) + self.largest_weights(level) + scratch
             };
-            most = most.max(held + works);
+            most = most.max(held + working);
         }
         most
     }
@@ -202,34 +230,35 @@ impl Pass<'_> {
         let all = self.sums(0..LEVELS);
         let bottom = self.map(LEVELS - 1) / 4;
         let deepest = self.channels(LEVELS - 1);
-        let latent = PLACES * deepest * deepest + self.scratch(deepest, deepest, bottom / deepest);
+        let scratch = self.scratch(deepest, deepest, bottom / deepest);
+        let latent = TILE_VALUES * deepest * deepest + scratch;
         let mut most = all + 2 * bottom + latent;
-        let in_step = self.plan.is_banded(self.grid);
-        for level in (usize::from(in_step)..LEVELS).rev() {
+        let is_large = self.plan.is_banded(self.grid);
+        for level in (usize::from(is_large)..LEVELS).rev() {
             let grid = self.grid_of(level);
-            let (to, below) = (self.channels(level), self.below(level));
-            let from = self.channels((level + 1).min(LEVELS - 1));
+            let below = self.below(level);
+            let weights = 16 * self.config.channels_below(level) * self.channels(level);
             let share = match self.plan.is_banded(grid) {
                 true => self.plan.band as f64 / grid.height as f64,
                 false => 1.0,
             };
-            // The decoded rows, and the rows below with their border.
-            let works = (share * (self.map(level) + below) as f64) as usize;
-            most = most.max(self.sums(0..level + 1) + below + works + 16 * from * to);
+            // The decoded rows, and the rows of the level below with their border.
+            let working = (share * (self.map(level) + below) as f64) as usize;
+            most = most.max(self.sums(0..level + 1) + below + working + weights);
         }
         let output = self.grid.pixels() * COLOR_CHANNELS;
-        let last = match in_step {
+        let last = match is_large {
             true => {
-                let waiting = self.encoder_count() * self.weights(0, false);
+                let waiting = self.encoder_count() * self.largest_weights(0);
                 self.below(0) + waiting + 3 * self.rows(0, self.plan.band + 2 * WAITING_ROWS)
             }
-            // The head's products: 9 values an output, in whole vectors.
+            // The head's products: 9 values per output, in whole vectors.
             false => self.map(0) + self.grid.pixels() * (32 + COLOR_CHANNELS),
         };
-        self.kept() + most.max(output + last)
+        self.skip_sources() + most.max(output + last)
     }
 
-    /// What the decoder has below a level.
+    /// The map below a level of the decoder.
     fn below(&self, level: usize) -> usize {
         match level + 1 {
             LEVELS => self.map(LEVELS - 1) / 4,

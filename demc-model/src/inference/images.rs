@@ -1,4 +1,4 @@
-//! The images that come in, and the way from planes to channels last.
+//! The input images and their conversion from planes to channels last.
 
 use std::ops::Range;
 
@@ -8,11 +8,12 @@ use burn::tensor::Tensor;
 use demc_kernels::Grid;
 use rayon::prelude::*;
 
-use super::Maps;
-use crate::config::{DETAIL_CHANNELS, Input};
+use super::FeatureMaps;
+use crate::config::{DETAIL_CHANNELS, Input, channels_of};
 
-/// What is to be denoised: planes of gamma-compressed colour, and of Z-scored features as long as they are needed.
-pub(super) struct Images {
+/// The images to denoise: planes of gamma-compressed colour, and of Z-scored features while they
+/// are needed.
+pub(super) struct InputImages {
     pub(super) grid: Grid,
     color: FlexTensor,
     features: Option<FlexTensor>,
@@ -25,11 +26,11 @@ fn host(tensor: Tensor<4>) -> FlexTensor {
     tensor.to_contiguous()
 }
 
-impl Images {
-    /// Of `[B, 3, H, W]` and `[B, 12, H, W]` on `flex`.
+impl InputImages {
+    /// The images `[B, 3, H, W]` and `[B, 12, H, W]` on `flex`.
     pub(super) fn new(color_gamma: Tensor<4>, features_z: Tensor<4>) -> Self {
         let [batch, _, height, width] = color_gamma.dims();
-        Images {
+        InputImages {
             grid: Grid {
                 batch,
                 height,
@@ -40,57 +41,59 @@ impl Images {
         }
     }
 
-    /// Those of its planes that make one of these inputs.
-    pub(super) fn keep(self, inputs: &[Input]) -> Self {
-        let keeps = inputs.contains(&Input::Features);
-        Images {
-            features: self.features.filter(|_| keeps),
+    /// The planes that `inputs` contain; frees the others.
+    pub(super) fn retain(self, inputs: &[Input]) -> Self {
+        let has_features = inputs.contains(&Input::Features);
+        InputImages {
+            features: self.features.filter(|_| has_features),
             ..self
         }
     }
 
-    /// Some inputs of a batch side by side, channels last; `detail` is the detail map where one of them is it.
-    pub(super) fn interleaved(&self, parts: &[Input], detail: Option<&Maps>) -> Maps {
-        let channels = parts.iter().map(|part| part.channels()).sum();
-        let mut all = Maps::new(self.grid, channels);
+    /// The concatenation of some inputs, channels last. `detail` is the detail map if one input is.
+    pub(super) fn interleaved(&self, parts: &[Input], detail: Option<&FeatureMaps>) -> FeatureMaps {
+        let mut all = FeatureMaps::new(self.grid, channels_of(parts));
         for image in 0..self.grid.batch {
             let rows = 0..self.grid.height;
             let detail = detail.map(|detail| detail.rows(image, rows.clone()));
-            let to = all.rows_mut(image, rows.clone());
-            self.interleave(image, rows, parts, detail, to);
+            let target = all.rows_mut(image, rows.clone());
+            self.interleave(image, rows, parts, detail, target);
         }
         all
     }
 
-    /// The same of some rows of an image; `detail` are those rows of the detail map.
+    /// The same for some rows of an image, into `target`; `detail` are these rows of the detail
+    /// map.
     pub(super) fn interleave(
         &self,
         image: usize,
         rows: Range<usize>,
         parts: &[Input],
         detail: Option<&[f32]>,
-        to: &mut [f32],
+        target: &mut [f32],
     ) {
         let Grid { height, width, .. } = self.grid;
-        let channels: usize = parts.iter().map(|part| part.channels()).sum();
-        let lines = to.par_chunks_mut(width * channels).enumerate();
-        lines.for_each(|(line, to)| {
-            let mut at = 0;
+        let channels = channels_of(parts);
+        let lines = target.par_chunks_mut(width * channels).enumerate();
+        lines.for_each(|(line, target)| {
+            let mut offset = 0;
             for part in parts {
                 let planes = match part {
                     Input::Color => self.color.storage::<f32>(),
                     Input::Features => {
                         let features = self.features.as_ref();
-                        features.expect("kept where needed").storage::<f32>()
+                        features
+                            .expect("features are retained while needed")
+                            .storage::<f32>()
                     }
                     Input::DetailMap => {
                         let detail = detail.expect("a variant with a fusion");
                         let detail = &detail[line * width * DETAIL_CHANNELS..];
                         let pixels = detail.chunks_exact(DETAIL_CHANNELS);
-                        for (to, from) in to.chunks_exact_mut(channels).zip(pixels) {
-                            to[at..at + DETAIL_CHANNELS].copy_from_slice(from);
+                        for (pixel, detail) in target.chunks_exact_mut(channels).zip(pixels) {
+                            pixel[offset..offset + DETAIL_CHANNELS].copy_from_slice(detail);
                         }
-                        at += DETAIL_CHANNELS;
+                        offset += DETAIL_CHANNELS;
                         continue;
                     }
                 };
@@ -98,10 +101,10 @@ impl Images {
                     let plane = image * part.channels() + channel;
                     let first = (plane * height + rows.start + line) * width;
                     let plane = &planes[first..first + width];
-                    for (to, from) in to.chunks_exact_mut(channels).zip(plane) {
-                        to[at] = *from;
+                    for (pixel, value) in target.chunks_exact_mut(channels).zip(plane) {
+                        pixel[offset] = *value;
                     }
-                    at += 1;
+                    offset += 1;
                 }
             }
         });

@@ -1,23 +1,26 @@
-//! The forward pass where nothing is differentiated: on slices of the host's memory, with as little of it as possible.
+//! The forward pass without autodiff, on slices of the host's memory, with little working memory.
 //!
-//! [`Denoiser::forward`](crate::Denoiser::forward) comes here by itself where the kernels run without autodiff. What it
-//! computes is what the modules say; how it does so differs in this:
+//! [`Denoiser::forward`](crate::Denoiser::forward) uses it where the kernels run without autodiff.
+//! It computes what the modules define, but differs in how:
 //!
-//! - Batch normalisations are folded into the convolutions before them (`layer`).
-//! - A skip fusion (Eq. 2) is linear before its ReLU. So the encoders' share of it is added up as soon as a level's skips
-//!   are there, into one map of the level's width; no skip lives on until the decoder, which adds its own share in place.
-//! - Large maps come in bands of rows (`band`): the fusion sub-network and the encoders' upper levels hand theirs on
-//!   while they are still in a cache, and of a decoder's level only a band is not yet fused (`encoder`, `decoder`).
-//! - No map of a large image's full resolution is ever whole but three channels in, three between and three out (`step`).
-//! - 3x3 convolutions multiply four times less than the plain sum (Winograd, F(4x4, 3x3)).
+//! - Batch normalisations are folded into the convolutions before them (`folded`).
+//! - A skip fusion (Eq. 2) is linear before its ReLU. So the encoders' shares of it are summed into
+//!   one map as soon as a level's skips are known. No skip is kept for the decoder, which adds its
+//!   share in place.
+//! - Large maps are computed in bands of rows (`band`). In the fusion sub-network and the encoders'
+//!   upper levels, a band passes on while it is still in a cache (`encoder`). In the decoder, only
+//!   a band of a level's input to the fusion is in memory (`decoder`).
+//! - For a large image, no map of the full resolution is ever whole, except those of a few
+//!   channels: input, detail map and output (`full_resolution`).
+//! - 3x3 convolutions need a quarter of the plain sum's multiplications (Winograd, F(4x4, 3x3)).
 
 mod band;
 mod decoder;
 mod encoder;
 mod estimate;
+mod folded;
+mod full_resolution;
 mod images;
-mod layer;
-mod step;
 #[cfg(test)]
 mod tests;
 
@@ -26,157 +29,152 @@ use std::ops::Range;
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use burn::tensor::{Tensor, TensorData};
-use demc_kernels::conv3x3::{self, Tile};
+use demc_kernels::conv3x3::{PreparedConvolution, Tile};
 use demc_kernels::{Grid, Isa, grid, memory};
 
 use crate::config::{COLOR_CHANNELS, LEVELS};
 use crate::denoiser::Denoiser;
-use crate::ops::Ops;
 use band::TILE_ROWS;
-use encoder::DEEPEST_BANDED;
-use images::Images;
-use step::{Again, LEVELS_IN_STEP};
+use encoder::{DEEPEST_BANDED, folded_block};
+use full_resolution::{SkipSources, UPPER_LEVELS};
+use images::InputImages;
 
-pub use estimate::{peak_bytes, reusable_bytes};
-pub use layer::{Layer, scale_of};
+pub use estimate::{pass_bytes, peak_bytes, reusable_bytes};
+pub use folded::{FoldedConv, norm_scale};
 
-/// Pixels of the full resolution in a band, for each thread: enough work to wake threads for, little enough for caches.
+/// Pixels of the full resolution in a band, per thread: enough work for a thread, little enough for
+/// caches.
 const BAND_PIXELS: usize = 20 << 10;
 
-/// Most rows of a band, however many threads there are: a large image is to come in bands on every machine.
+/// Largest number of rows of a band, so that a large image is computed in bands on every machine.
 const MOST_ROWS: usize = 256;
 
-/// What a band's rows are a multiple of: a tile at the level below, too.
+/// The rows of a band are a multiple of this: of a tile, at the level below, too.
 const BAND_STEP: usize = 2 * TILE_ROWS;
 
-/// Whether an image on this tensor's device is denoised here.
-pub(crate) fn applies(model: &Denoiser, image: &Tensor<4>) -> bool {
-    let device = image.device();
-    let plain = !device.is_autodiff() && !model.latent.conv.weight.val().device().is_autodiff();
-    plain && model.ops().on(&device) == Ops::Kernels
-}
-
-/// As [`Denoiser::forward`], which has checked the shapes.
+/// See [`Denoiser::forward`], which has checked the shapes.
 pub(crate) fn forward(
     model: &Denoiser,
     color_gamma: Tensor<4>,
     features_z: Tensor<4>,
 ) -> Tensor<4> {
-    let plan = Plan::new(color_gamma.dims()[3]);
+    let plan = BandPlan::new(color_gamma.dims()[3]);
     forward_with(model, color_gamma, features_z, Tile::F4, plan)
 }
 
-/// The same with tiles of a given size and another plan.
+/// The same with a given size of tiles and plan.
 fn forward_with(
     model: &Denoiser,
     color_gamma: Tensor<4>,
     features_z: Tensor<4>,
     tile: Tile,
-    plan: Plan,
+    plan: BandPlan,
 ) -> Tensor<4> {
     let [batch, _, height, width] = color_gamma.dims();
-    let run = Run {
+    let pass = InferencePass {
         isa: Isa::current(),
         tile,
         plan,
         model,
     };
-    let out = run.decode(run.encode(Images::new(color_gamma, features_z)));
+    let encoded = pass.encode(InputImages::new(color_gamma, features_z));
+    let out = pass.decode(encoded);
     let shape = [batch, COLOR_CHANNELS, height, width];
     Tensor::from_primitive::<Flex>(FlexTensor::from_data(TensorData::new(out, shape)))
 }
 
-/// How an image is cut.
+/// The size of the bands of an image.
 #[derive(Clone, Copy)]
-struct Plan {
-    /// Rows of a band. At every level a row is as many values and as much work where the channels double, as the paper's do, while the width halves.
+struct BandPlan {
+    /// Rows of a band at every level. With the paper's levels, where channels double and the width
+    /// halves, a row has the same number of values at every level.
     band: usize,
     /// Threads that share the work on a band.
     threads: usize,
 }
 
-impl Plan {
-    /// For images of this width and the threads at hand.
+impl BandPlan {
+    /// The plan for images of this width with the current number of threads.
     fn new(width: usize) -> Self {
         let threads = rayon::current_num_threads();
         let rows = BAND_PIXELS * threads / width;
-        Plan {
+        BandPlan {
             band: rows.clamp(1, MOST_ROWS).next_multiple_of(BAND_STEP),
             threads,
         }
     }
 
-    /// Whether maps on `grid` come in bands: two bands or less save nothing.
+    /// Whether maps on `grid` are computed in bands: two bands or fewer save nothing.
     fn is_banded(self, grid: Grid) -> bool {
         grid.height > 2 * self.band
     }
 }
 
 /// One pass through the network.
-struct Run<'a> {
+struct InferencePass<'a> {
     isa: Isa,
     tile: Tile,
-    plan: Plan,
+    plan: BandPlan,
     model: &'a Denoiser,
 }
 
-/// What the encoders leave for the decoder.
-struct Encoded {
-    /// The skips' share of each level's fusion, from the full resolution down; without the first where it is `again`.
-    sums: Vec<Maps>,
-    /// What the first level's skips can be computed from once more.
-    again: Option<Again>,
+/// The result of the encoders.
+struct EncodedImages {
+    /// The skips' share of each level's fusion, from the full resolution down; without the first
+    /// level if `sources` holds its inputs.
+    sums: Vec<FeatureMaps>,
+    /// The inputs from which the first level's skips are recomputed.
+    sources: Option<SkipSources>,
     /// The latent's input.
-    bottom: Maps,
+    bottom: FeatureMaps,
 }
 
-impl Run<'_> {
-    /// All encoders, all levels.
-    fn encode(&self, images: Images) -> Encoded {
-        let (mut sums, mut again) = (Vec::with_capacity(LEVELS), None);
+impl InferencePass<'_> {
+    /// Computes all levels of all encoders.
+    fn encode(&self, images: InputImages) -> EncodedImages {
+        let (mut sums, mut sources) = (Vec::with_capacity(LEVELS), None);
         let (first, mut inputs) = match self.plan.is_banded(images.grid) {
             true => {
-                let step = self.descend_in_step(images);
-                sums.push(step.sum);
-                again = Some(step.again);
-                (LEVELS_IN_STEP, step.below)
+                let upper = self.encode_upper_levels(images);
+                sums.push(upper.sum);
+                sources = Some(upper.sources);
+                (UPPER_LEVELS, upper.below)
             }
-            false => (0, self.inputs(images)),
+            false => (0, self.encoder_inputs(images)),
         };
         for level in first..LEVELS {
             let grid = inputs[0].grid;
             let banded = level <= DEEPEST_BANDED && self.plan.is_banded(grid);
             sums.push(match banded {
-                true => self.descend_in_bands(level, &mut inputs),
-                false => self.descend(level, &mut inputs),
+                true => self.encode_level_in_bands(level, &mut inputs),
+                false => self.encode_level(level, &mut inputs),
             });
         }
         let bottom = inputs.pop().expect("the last encoder feeds the latent");
-        Encoded {
+        EncodedImages {
             sums,
-            again,
+            sources,
             bottom,
         }
     }
 
-    /// Planar images `[B, 3, H, W]` from what the encoders left.
-    fn decode(&self, encoded: Encoded) -> Vec<f32> {
-        let Encoded {
+    /// Planar images `[B, 3, H, W]` from the result of the encoders.
+    fn decode(&self, encoded: EncodedImages) -> Vec<f32> {
+        let EncodedImages {
             sums,
-            again,
+            sources,
             bottom,
         } = encoded;
-        let latent = &self.model.latent;
-        let mut x = self.conv3x3(&bottom, &Layer::conv(&latent.conv, latent.norm.as_ref()));
+        let mut x = self.conv3x3(&bottom, &folded_block(&self.model.latent));
         drop(bottom);
         let decoder = &self.model.decoder;
         for (level, sum) in decoder.levels.iter().zip(sums.into_iter().rev()) {
-            x = self.ascend(level, &x, sum);
+            x = self.decode_level(level, &x, sum);
         }
-        match again {
-            Some(again) => self.finish_in_step(&x, again),
+        match sources {
+            Some(sources) => self.decode_full_resolution(&x, sources),
             None => {
-                let image = self.conv3x3(&x, &Layer::conv(&decoder.head, None));
+                let image = self.conv3x3(&x, &FoldedConv::conv(&decoder.head, None));
                 let mut planar = memory::buffer(image.values.len());
                 grid::nchw_from_nhwc(image.grid, &image.values, &mut planar);
                 planar
@@ -184,25 +182,26 @@ impl Run<'_> {
         }
     }
 
-    /// A convolution with its ReLU, of whole maps.
-    fn conv3x3(&self, x: &Maps, layer: &Layer) -> Maps {
-        let mut y = Maps::new(x.grid, layer.outputs());
-        let conv = conv3x3::Ready::new(self.isa, self.tile, layer.weight(), layer.bias(), true);
-        conv.forward(x.grid, &x.values, 0, &mut y.values);
+    /// A convolution of whole maps with a ReLU.
+    fn conv3x3(&self, x: &FeatureMaps, conv: &FoldedConv) -> FeatureMaps {
+        let mut y = FeatureMaps::new(x.grid, conv.outputs());
+        let (weight, bias) = (conv.weight(), conv.bias());
+        let prepared = PreparedConvolution::new(self.isa, self.tile, weight, bias, true);
+        prepared.forward(x.grid, &x.values, 0, &mut y.values);
         y
     }
 }
 
 /// Feature maps of a batch, channels last.
-struct Maps {
+struct FeatureMaps {
     grid: Grid,
     values: Vec<f32>,
 }
 
-impl Maps {
-    /// With whatever values.
+impl FeatureMaps {
+    /// Maps to be written; their initial values are arbitrary.
     fn new(grid: Grid, channels: usize) -> Self {
-        Maps {
+        FeatureMaps {
             grid,
             values: memory::buffer(grid.pixels() * channels),
         }
@@ -212,7 +211,7 @@ impl Maps {
         self.values.len() / self.grid.pixels()
     }
 
-    /// The grid of some rows of one image.
+    /// The grid of `rows` rows of one image.
     fn band(&self, rows: usize) -> Grid {
         Grid {
             batch: 1,
@@ -221,23 +220,23 @@ impl Maps {
         }
     }
 
-    /// Some rows of an image.
+    /// The values of some rows of an image.
     fn rows(&self, image: usize, rows: Range<usize>) -> &[f32] {
-        &self.values[self.place(image, rows)]
+        &self.values[self.range(image, rows)]
     }
 
     fn rows_mut(&mut self, image: usize, rows: Range<usize>) -> &mut [f32] {
-        let place = self.place(image, rows);
-        &mut self.values[place]
+        let range = self.range(image, rows);
+        &mut self.values[range]
     }
 
-    fn place(&self, image: usize, rows: Range<usize>) -> Range<usize> {
+    fn range(&self, image: usize, rows: Range<usize>) -> Range<usize> {
         let row = self.grid.width * self.channels();
         let first = image * self.grid.height;
         (first + rows.start) * row..(first + rows.end) * row
     }
 
-    /// These rows with one more on each side where there is one, and how many there are above.
+    /// The rows with one more on each side, inside the map, and the number of rows added above.
     fn with_neighbours(&self, rows: Range<usize>) -> (Range<usize>, usize) {
         let start = rows.start.saturating_sub(1);
         (

@@ -1,21 +1,21 @@
-//! Bands against whole maps: `demc-model/tests/inference.rs` compares whole networks with Burn's operations.
+//! Bands compared with whole maps. `demc-model/tests/inference.rs` compares with Burn's operations.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_kernels::conv3x3::Tile;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{Plan, forward_with};
+use super::{BandPlan, forward_with};
 use crate::{Denoiser, Head, ModelConfig, Ops, Reading, Variant};
 
-/// No bands: more rows than any image here.
+/// More rows than any image here, so no bands.
 const WHOLE: usize = 4096;
 
-/// Narrower and wider from level to level.
+/// Levels that become narrower and wider.
 const LEVELS: [usize; 5] = [3, 1, 2, 2, 4];
 
 fn network(variant: Variant, reading: Reading) -> Denoiser {
-    drawn(ModelConfig {
+    initialised(ModelConfig {
         variant,
         reading,
         width: 6,
@@ -24,7 +24,7 @@ fn network(variant: Variant, reading: Reading) -> Denoiser {
     })
 }
 
-fn drawn(config: ModelConfig) -> Denoiser {
+fn initialised(config: ModelConfig) -> Denoiser {
     let mut rng = ChaCha8Rng::seed_from_u64(7);
     config.init(&mut rng, [0.5; 3], &Device::flex())
 }
@@ -43,11 +43,11 @@ fn images([batch, height, width]: [usize; 3]) -> [Tensor<4>; 2] {
     })
 }
 
-/// Bands of so many rows.
-fn plan(band: usize) -> Plan {
-    Plan {
+/// A plan with bands of `band` rows.
+fn plan(band: usize) -> BandPlan {
+    BandPlan {
         band,
-        ..Plan::new(1)
+        ..BandPlan::new(1)
     }
 }
 
@@ -68,7 +68,7 @@ fn every_network(check: impl Fn(&Denoiser, &str, [usize; 3])) {
             for size in SIZES {
                 check(&model, &format!("{} {size:?}", model.config()), size);
             }
-            check(&drawn(levels), &format!("{levels}"), SIZES[1]);
+            check(&initialised(levels), &format!("{levels}"), SIZES[1]);
         }
     }
 }
@@ -88,11 +88,12 @@ fn bands_give_the_bits_of_whole_maps() {
     });
 }
 
-/// Of the largest value, with tiles as exact as the plain sum: roundings of float32 through 27 layers.
+/// Share of the largest value. Small tiles are as exact as the plain sum; float32 rounds through 27
+/// layers.
 const TOLERANCE: f32 = 1e-5;
 
 #[test]
-fn bands_of_small_tiles_are_burns_network() {
+fn bands_of_small_tiles_agree_with_burns_operations() {
     every_network(|model, name, size| {
         let found = run(model, size, Tile::F2, 8);
         let [color, features] = images(size);
@@ -114,7 +115,7 @@ fn bands_of_small_tiles_are_burns_network() {
 }
 
 #[test]
-fn an_image_in_a_batch_is_the_image_alone() {
+fn an_image_in_a_batch_has_the_bits_of_the_image_alone() {
     let model = network(Variant::Demc, Reading::Paper);
     let size = [2, 96, 64];
     let both = run(&model, size, Tile::F4, 8);

@@ -1,10 +1,10 @@
-//! The colour spaces that FLIP goes through: sRGB, linear RGB, XYZ, its opponent space YCxCz and Hunt-adjusted L*a*b*.
-//! D65, single precision, constants of Andersson et al. 2020.
+//! The colour spaces of FLIP: sRGB, linear RGB, XYZ, the opponent space YCxCz and Hunt-adjusted
+//! L*a*b*. D65, single precision, constants of Andersson et al. 2020.
 
-/// A pixel.
+/// The colour of a pixel.
 pub(super) type Color = [f32; 3];
 
-/// XYZ of linear RGB.
+/// Matrix from linear RGB to XYZ.
 const XYZ_FROM_RGB: [[f32; 3]; 3] = [
     [
         (10135552.0_f64 / 24577794.0) as f32,
@@ -22,7 +22,7 @@ const XYZ_FROM_RGB: [[f32; 3]; 3] = [
         (70074185.0_f64 / 73733382.0) as f32,
     ],
 ];
-/// Its inverse.
+/// Matrix from XYZ to linear RGB.
 const RGB_FROM_XYZ: [[f32; 3]; 3] = [
     [3.241_003_3, -1.537_398_9, -0.498_615_9],
     [-0.969_224_3, 1.875_93, 0.041_554_22],
@@ -56,12 +56,12 @@ pub(super) fn linear_from_opponent([y, cx, cz]: Color) -> Color {
     )
 }
 
-/// L*a*b* of linear RGB, chroma scaled by lightness as Hunt found it to be seen.
+/// L*a*b* of linear RGB, with chroma scaled by lightness (the Hunt effect).
 pub(super) fn hunt_lab_from_linear(rgb: Color) -> Color {
     const DELTA: f32 = 6.0 / 29.0;
     let f = |t: f32| {
         if t > DELTA * DELTA * DELTA {
-            // Half the time of `cbrt`, and as exact in single precision as is needed.
+            // Takes half the time of `cbrt` and is exact enough in single precision.
             t.powf(1.0 / 3.0)
         } else {
             t / (3.0 * DELTA * DELTA) + 4.0 / 29.0
@@ -73,7 +73,7 @@ pub(super) fn hunt_lab_from_linear(rgb: Color) -> Color {
     [l, hunt * 500.0 * (x - y), hunt * 200.0 * (y - z)]
 }
 
-/// The distance HyAB of two L*a*b* colours.
+/// The HyAB distance of two L*a*b* colours.
 pub(super) fn hyab(a: Color, b: Color) -> f32 {
     let [l, x, y] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
     l.abs() + (x * x + y * y).sqrt()
@@ -93,7 +93,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn white_and_black_are_where_they_belong() {
+    fn white_and_black_have_their_known_values() {
         let near = |found: Color, expected: Color| {
             for (a, b) in found.into_iter().zip(expected) {
                 assert!((a - b).abs() < 2e-3, "{found:?} {expected:?}");
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn the_opponent_space_has_a_way_back() {
+    fn the_opponent_space_has_an_inverse() {
         for rgb in [[0.2, 0.5, 0.9], [1.0, 0.0, 0.0], [0.01, 0.02, 0.005]] {
             let back = linear_from_opponent(opponent_from_linear(rgb));
             for (a, b) in rgb.into_iter().zip(back) {

@@ -1,12 +1,12 @@
-//! Separable filters of a plane, in the order that lets the compiler use vectors.
+//! Separable filters of a plane, with loops that the compiler vectorises.
 
 use std::ops::{AddAssign, Mul};
 
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-/// Correlates the columns of `plane` with `down`, then its rows with `across`, both of odd length. Outside of the plane lies the
-/// pixel at its edge, again and again.
+/// Correlates the columns of `plane` with `down`, then its rows with `across`, both of odd length.
+/// Pixels at the edge repeat outside of the plane.
 ///
 /// # Shapes
 /// `[H, W]` to itself.
@@ -15,7 +15,7 @@ pub(super) fn separable(plane: &[f32], width: usize, across: &[f32], down: &[f32
     let (beside, above) = (across.len() / 2, down.len() / 2);
     let mut out = vec![0.0; plane.len()];
     let rows = out.par_chunks_mut(width).enumerate();
-    // One row of a thread's own between the two, and no plane.
+    // Between the two passes each thread stores one row, not a plane.
     rows.for_each_init(
         || vec![0.0; width + 2 * beside],
         |padded, (y, out)| {
@@ -36,7 +36,8 @@ pub(super) fn separable(plane: &[f32], width: usize, across: &[f32], down: &[f32
     out
 }
 
-/// `out += tap * values`. The same bits with any instructions: products and sums are rounded one by one.
+/// `out += tap * values`. Products and sums are rounded one by one, so all instruction sets give
+/// the same bits.
 #[multiversion(targets("x86_64+avx512f", "x86_64+avx2"))]
 pub(super) fn add<T: Copy + AddAssign + Mul<Output = T>>(out: &mut [T], values: &[T], tap: T) {
     for (out, &value) in out.iter_mut().zip(values) {
@@ -49,8 +50,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn edges_are_repeated_by_hand() {
-        // 2 rows of 3: 1 2 3 / 4 5 6, taps 1 0 2 across and 1 alone down.
+    fn edges_repeat_as_in_a_hand_computed_case() {
+        // 2 rows of 3: 1 2 3 / 4 5 6, with taps 1 0 2 across and 1 down.
         let plane = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
         let across = [1.0, 0.0, 2.0];
         let all = separable(&plane, 3, &across, &[1.0]);

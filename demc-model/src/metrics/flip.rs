@@ -1,8 +1,11 @@
 //! LDR-FLIP: "FLIP: A Difference Evaluator for Alternating Images", Andersson et al., HPG 2020.
 //!
-//! Both images are filtered by what an eye resolves at 67 pixels a degree, compared by colour, and the difference is
-//! raised where edges or points appear or vanish. Written here because the crate that wraps NVIDIA's C++ (`nv-flip` 0.1.2)
-//! takes 8 bits a channel and makes every build need a C++17 compiler; the tests compare with NVIDIA's own Python package.
+//! Both images are filtered by the contrast sensitivity of an eye at 67 pixels per degree and
+//! compared by colour. Edges and points that appear or vanish raise the difference.
+//!
+//! The crate around NVIDIA's C++ (`nv-flip` 0.1.2) takes 8 bits per channel and needs a C++17
+//! compiler, so this is an implementation of ours. The tests compare it with NVIDIA's Python
+//! package.
 
 use std::f32::consts::PI;
 
@@ -14,7 +17,8 @@ use super::color::{
 };
 use super::filter::separable;
 
-/// Pixels a degree of the viewer's angle: 0.7 m from a monitor that is 0.7 m and 3840 pixels wide (the paper's).
+/// Pixels per degree of visual angle: 0.7 m from a monitor that is 0.7 m and 3840 pixels wide (the
+/// FLIP paper).
 const PIXELS_PER_DEGREE: f32 = 0.7 * 3840.0 / 0.7 * (PI / 180.0);
 /// Contrast sensitivity of Y, Cx and Cz: two Gaussians `(a, b)` each.
 const SENSITIVITY: [[(f32, f32); 2]; 3] = [
@@ -22,20 +26,21 @@ const SENSITIVITY: [[(f32, f32); 2]; 3] = [
     [(1.0, 0.0053), (0.0, 1e-5)],
     [(34.1, 0.04), (13.5, 0.025)],
 ];
-/// Widest of them.
+/// The largest `b` of [`SENSITIVITY`].
 const WIDEST: f32 = 0.04;
-/// Width of the edge and point detectors, degrees.
+/// Width of the edge and point detectors in degrees.
 const FEATURE_WIDTH: f32 = 0.082;
-/// Exponent of the colour difference; that of the feature difference is a half.
+/// Exponent of the colour difference. The exponent of the feature difference is 1/2.
 const COLOR_POWER: f32 = 0.7;
-/// Below this share of the largest colour difference, errors take up to [`KNEE_VALUE`] of the scale.
+/// Colour differences up to this share of the largest map to errors up to [`KNEE_VALUE`].
 const KNEE: f32 = 0.4;
+/// The error at [`KNEE`].
 const KNEE_VALUE: f32 = 0.95;
 
 /// Mean `flip` of an image, 0 to 1.
 ///
 /// # Panics
-/// Where the sizes differ.
+/// If the sizes differ.
 pub fn flip(candidate: &Image, reference: &Image) -> f64 {
     candidate.assert_size_of(reference);
     let (a, b) = (candidate.appearance(), reference.appearance());
@@ -64,7 +69,7 @@ pub fn flip(candidate: &Image, reference: &Image) -> f64 {
     errors.iter().map(|e| f64::from(*e)).sum::<f64>() / errors.len() as f64
 }
 
-/// What FLIP sees of an image.
+/// The filtered image that FLIP compares.
 pub(super) struct Appearance {
     /// Filtered colours.
     lab: Vec<Color>,
@@ -73,16 +78,17 @@ pub(super) struct Appearance {
 }
 
 impl Appearance {
-    /// Of display values in 0 to 1, planar.
+    /// The appearance of planar display values in 0 to 1.
     pub(super) fn new(display: &[f64], width: usize) -> Self {
         let pixels = display.len() / 3;
         let mut planes = display.chunks(pixels);
         if pixels > 1 && planes.all(|plane| plane.iter().all(|value| *value == plane[0])) {
-            // One colour, as the black image: what is seen of one pixel is seen everywhere, for filters repeat the edge.
-            let one = Self::new(&[0, 1, 2].map(|c| display[c * pixels]), 1);
+            // An image of one colour: filters repeat the edge, so all pixels look like a single
+            // one.
+            let single = Self::new(&[0, 1, 2].map(|c| display[c * pixels]), 1);
             return Self {
-                lab: vec![one.lab[0]; pixels],
-                features: vec![one.features[0]; pixels],
+                lab: vec![single.lab[0]; pixels],
+                features: vec![single.features[0]; pixels],
             };
         }
         let opponent: Vec<Color> = (0..pixels)
@@ -93,12 +99,12 @@ impl Appearance {
             })
             .collect();
         let plane = |c: usize| opponent.iter().map(|color| color[c]).collect::<Vec<f32>>();
-        let seen: [Vec<f32>; 3] =
+        let filtered: [Vec<f32>; 3] =
             std::array::from_fn(|c| sensitivity(&plane(c), width, SENSITIVITY[c]));
         let lab = (0..pixels)
             .into_par_iter()
             .map(|i| {
-                let rgb = linear_from_opponent([seen[0][i], seen[1][i], seen[2][i]]);
+                let rgb = linear_from_opponent([filtered[0][i], filtered[1][i], filtered[2][i]]);
                 hunt_lab_from_linear(rgb.map(|x| x.clamp(0.0, 1.0)))
             })
             .collect();
@@ -110,7 +116,7 @@ impl Appearance {
     }
 }
 
-/// A plane filtered by a contrast sensitivity, a sum of two Gaussians that together weigh 1.
+/// A plane filtered by a contrast sensitivity: two Gaussians with a total weight of 1.
 fn sensitivity(plane: &[f32], width: usize, gaussians: [(f32, f32); 2]) -> Vec<f32> {
     let radius = (3.0 * (WIDEST / (2.0 * PI * PI)).sqrt() * PIXELS_PER_DEGREE).ceil() as i32;
     let taps = |b: f32| -> Vec<f32> {
@@ -124,7 +130,7 @@ fn sensitivity(plane: &[f32], width: usize, gaussians: [(f32, f32); 2]) -> Vec<f
         .sum();
     let mut out = vec![0.0; plane.len()];
     for (weight, taps) in weighted.iter().filter(|(weight, _)| *weight > 0.0) {
-        // What single precision does not see of the narrow ones is left out.
+        // Taps of narrow Gaussians that vanish in single precision are left out.
         let faint = taps.iter().take_while(|tap| **tap < 1e-9).count();
         let taps = &taps[faint..taps.len() - faint];
         let part = separable(plane, width, taps, taps);
@@ -139,10 +145,12 @@ fn sensitivity(plane: &[f32], width: usize, gaussians: [(f32, f32); 2]) -> Vec<f
 fn features(grey: &[f32], width: usize) -> Vec<[f32; 2]> {
     let deviation = 0.5 * FEATURE_WIDTH * PIXELS_PER_DEGREE;
     let radius = (3.0 * deviation).ceil() as i32;
-    let taps = |of: fn(f32) -> f32| -> Vec<f32> {
-        let places = (-radius..=radius).map(|i| i as f32 / deviation);
-        let raw: Vec<f32> = places.map(|x| of(x) * (-x * x / 2.0).exp()).collect();
-        // Positive and negative taps weigh 1 each.
+    let taps = |factor: fn(f32) -> f32| -> Vec<f32> {
+        let positions = (-radius..=radius).map(|i| i as f32 / deviation);
+        let raw: Vec<f32> = positions
+            .map(|x| factor(x) * (-x * x / 2.0).exp())
+            .collect();
+        // Positive and negative taps have a sum of 1 each.
         let weight = |sign: f32| raw.iter().map(|t| (t * sign).max(0.0)).sum::<f32>();
         let (positive, negative) = (weight(1.0), weight(-1.0));
         raw.iter()
@@ -177,19 +185,20 @@ mod tests {
     }
 
     #[test]
-    fn an_image_does_not_differ_from_itself_and_black_from_white_by_nearly_all() {
+    fn flip_is_zero_for_equal_images_and_nearly_one_for_black_and_white() {
         let (black, white) = (constant(0.0), constant(1.0));
         let image = |hdr| Image::new(hdr, 30, 40).expect("finite");
         let (black, white) = (image(&black), image(&white));
         assert_eq!(flip(&white, &white), 0.0);
-        // 100^0.7 = 25.1 of 41.3, above the knee of 0.4: 0.95 + (25.1 - 16.5) / 24.8 * 0.05 = 0.967.
+        // 100^0.7 = 25.1 of 41.3, above the knee of 0.4: 0.95 + (25.1 - 16.5) / 24.8 * 0.05 =
+        // 0.967.
         let found = flip(&black, &white);
         assert!((found - 0.967).abs() < 0.002, "{found}");
         assert!((flip(&white, &black) - found).abs() < 1e-6);
     }
 
     #[test]
-    fn a_point_is_seen_more_than_its_colour_alone() {
+    fn a_point_is_a_feature() {
         let flat = constant(0.5);
         let mut point = flat.clone();
         for c in 0..3 {
@@ -203,6 +212,6 @@ mod tests {
         let centre = 15 * 40 + 20;
         let [flat, point] = [a.features[centre][1], b.features[centre][1]];
         assert!(flat < 1e-4 && point > 0.01, "{flat} {point}");
-        assert!(b.features[0][1] < 1e-4, "far from it nothing is");
+        assert!(b.features[0][1] < 1e-4, "no feature far from the point");
     }
 }

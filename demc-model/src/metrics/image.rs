@@ -1,4 +1,4 @@
-//! An image that can be measured: finite, with what several metrics need of it computed once.
+//! A finite image, with the intermediate results that several metrics share.
 
 use std::sync::OnceLock;
 
@@ -7,20 +7,20 @@ use rayon::prelude::*;
 use super::DISPLAY_GAMMA;
 use super::flip::Appearance;
 
-/// Why an image cannot be measured.
+/// The reason that an image has no metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum ImageError {
-    /// NaN or infinite values: dropping them would flatter the image.
+    /// NaN or infinite values. Metrics without them would flatter the image.
     #[error("{count} NaN or infinite values in {pixels} pixels")]
     NonFinite {
-        /// How many values.
+        /// Number of such values.
         count: usize,
-        /// In how many pixels.
+        /// Number of pixels with such values.
         pixels: usize,
     },
 }
 
-/// An image in linear HDR with nothing in it that is not finite.
+/// An image in linear HDR with finite values only.
 pub struct Image<'a> {
     hdr: &'a [f32],
     height: usize,
@@ -39,7 +39,7 @@ impl<'a> Image<'a> {
     /// [`ImageError::NonFinite`].
     ///
     /// # Panics
-    /// Where the length is another, or there are no pixels.
+    /// If `hdr` has another length or the image has no pixels.
     pub fn new(hdr: &'a [f32], height: usize, width: usize) -> Result<Self, ImageError> {
         let pixels = height * width;
         assert!(pixels > 0, "an image has pixels");
@@ -69,7 +69,7 @@ impl<'a> Image<'a> {
         (self.height, self.width)
     }
 
-    /// Computes what several metrics share, before they are taken on several threads.
+    /// Computes the intermediate results that metrics share, before they run on several threads.
     pub fn prepare(&self) {
         self.appearance();
     }
@@ -83,26 +83,26 @@ impl<'a> Image<'a> {
     pub(super) fn display(&self) -> &[f64] {
         once::<Vec<f64>>(&self.display, || {
             let power = 1.0 / DISPLAY_GAMMA;
-            let shown = |x: &f32| f64::from(x.clamp(0.0, 1.0).powf(power));
-            self.hdr.par_iter().map(shown).collect()
+            let display = |x: &f32| f64::from(x.clamp(0.0, 1.0).powf(power));
+            self.hdr.par_iter().map(display).collect()
         })
     }
 
-    /// What FLIP compares.
+    /// The appearance that FLIP compares.
     pub(super) fn appearance(&self) -> &Appearance {
         once(&self.appearance, || {
             Appearance::new(self.display(), self.width)
         })
     }
 
-    /// Fails a programmer who compares images of two sizes.
+    /// Panics if the images have different sizes, which is a programmer's error.
     pub(super) fn assert_size_of(&self, other: &Image) {
         assert_eq!(self.size(), other.size(), "images of one size");
     }
 }
 
-/// What is in the cell, or what is computed for it. Not inside of it: a thread of the pool that waits for its parts may begin
-/// another metric, and would wait for itself.
+/// The value of the cell, computed at the first call. The cell is not locked meanwhile: a thread
+/// that waits for parallel work may start another metric, which would then wait for its own thread.
 fn once<T>(cell: &OnceLock<T>, compute: impl FnOnce() -> T) -> &T {
     match cell.get() {
         Some(value) => value,
@@ -118,7 +118,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn values_that_are_not_finite_are_counted_and_refused() {
+    fn nan_and_infinite_values_are_counted_and_refused() {
         let mut hdr = vec![0.5; 3 * 4];
         hdr[1] = f32::NAN;
         hdr[5] = f32::INFINITY;

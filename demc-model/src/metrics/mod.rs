@@ -1,10 +1,11 @@
-//! How near an image is to its reference: one table of metrics, each under a name that has one meaning.
+//! The metrics of an image against its reference, in one table. Each name has one meaning.
 //!
-//! "RelMSE" and "SSIM" mean many things in this field, and a number without its variant cannot be compared. `relmse`
-//! here is the paper's: it **sums** over the three channels and averages over pixels, in linear HDR. [`METRICS`] holds
-//! what others report, so that a number can be put beside theirs.
+//! "RelMSE" and "SSIM" have many variants in this field; numbers of different variants cannot be
+//! compared. `relmse` is the paper's: it **sums** over the three channels and averages over pixels,
+//! in linear HDR. [`METRICS`] also holds the variants that others report, for comparison with their
+//! numbers.
 //!
-//! Nothing is measured on an image with NaN or infinite values: [`Image::new`] counts and refuses them.
+//! An image with NaN or infinite values has no metrics: [`Image::new`] counts and refuses them.
 
 mod color;
 mod filter;
@@ -26,35 +27,36 @@ pub use flip::flip;
 /// Epsilon of Eq. 5.
 pub const LOSS_EPSILON: f32 = 0.001;
 
-/// Gamma of the tone mapping that SSIM and pictures use; the paper's Eq. 4.
+/// Gamma of the tone mapping for SSIM and pictures (Eq. 4).
 pub const DISPLAY_GAMMA: f32 = 2.2;
 
-/// A metric.
+/// A row of the table of metrics.
 #[derive(Debug, Clone, Copy)]
 pub struct Metric {
-    /// Its name, with the variant: what every output calls it.
+    /// The name with the variant, as in every output.
     pub name: &'static str,
-    /// What it is, in words; c is the candidate, r the reference.
+    /// The definition in words; c is the candidate, r the reference.
     pub definition: &'static str,
-    /// Which values are good.
+    /// The values that are better.
     pub better: Better,
-    /// Its value for a candidate (first) and a reference of one size; `None` where it has none.
-    pub of: fn(&Image, &Image) -> Option<f64>,
+    /// The value for a candidate (first) and a reference of one size; `None` if the metric is
+    /// undefined.
+    pub measure: fn(&Image, &Image) -> Option<f64>,
 }
 
-/// Which values of a metric are good.
+/// The values of a metric that are better.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Better {
-    /// Small ones.
+    /// Smaller values.
     Lower,
-    /// Large ones.
+    /// Larger values.
     Higher,
-    /// Those near zero, on either side.
+    /// Values nearer to zero, on either side.
     Zero,
 }
 
 impl Better {
-    /// The word in a table: `lower`, `higher` or `zero`.
+    /// The word for tables: `lower`, `higher` or `zero`.
     pub fn word(self) -> &'static str {
         match self {
             Better::Lower => "lower",
@@ -63,7 +65,7 @@ impl Better {
         }
     }
 
-    /// Where the best values are, after "best": `where small`, `where large`, `near zero`.
+    /// The phrase after "best": `where small`, `where large` or `near zero`.
     pub fn phrase(self) -> &'static str {
         match self {
             Better::Lower => "where small",
@@ -72,7 +74,8 @@ impl Better {
         }
     }
 
-    /// A value on a scale where two can be compared: its distance from zero where that is what counts.
+    /// The value on a scale where two values can be compared: the distance from zero for
+    /// [`Better::Zero`].
     pub fn comparable(self, value: f64) -> f64 {
         match self {
             Better::Zero => value.abs(),
@@ -80,7 +83,8 @@ impl Better {
         }
     }
 
-    /// Whether a difference of two [`comparable`](Self::comparable) values speaks for the first.
+    /// Whether the first of two [`comparable`](Self::comparable) values with this difference is
+    /// better.
     pub fn prefers(self, difference: f64) -> bool {
         match self {
             Better::Higher => difference > 0.0,
@@ -89,67 +93,67 @@ impl Better {
     }
 }
 
-/// All metrics, the two headlines first.
+/// All metrics, the two headline metrics first.
 pub const METRICS: [Metric; 10] = [
     Metric {
         name: "relmse",
         definition: "sum over rgb of (c - r)^2 / (r^2 + 0.001), mean over pixels, linear HDR (the paper's Eq. 5)",
         better: Better::Lower,
-        of: |c, r| Some(rel_mse(c, r)),
+        measure: |c, r| Some(rel_mse(c, r)),
     },
     Metric {
         name: "ssim",
         definition: "Wang et al. 2004 on clip(x, 0, 1)^(1/2.2): 11x11 Gaussian window, sigma 1.5, inner windows only, mean of the channels",
         better: Better::Higher,
-        of: ssim,
+        measure: ssim,
     },
     Metric {
         name: "relmse@afgsa",
         definition: "0.5 x mean over values of (c - r)^2 / (r^2 + 0.01) (AFGSA, ACFM)",
         better: Better::Lower,
-        of: |c, r| Some(rel_mse_afgsa(c, r)),
+        measure: |c, r| Some(rel_mse_afgsa(c, r)),
     },
     Metric {
         name: "relmse@sbmc",
         definition: "mean over values of (c - r)^2 / (r^2 + 0.0001), without a border of 21 pixels (SBMC)",
         better: Better::Lower,
-        of: rel_mse_sbmc,
+        measure: rel_mse_sbmc,
     },
     Metric {
         name: "mrse@pbrt",
         definition: "mean over values of (c - r)^2 / (r + 0.01)^2 (pbrt-v4's imgtool diff)",
         better: Better::Lower,
-        of: |c, r| Some(mrse_pbrt(c, r)),
+        measure: |c, r| Some(mrse_pbrt(c, r)),
     },
     Metric {
         name: "relmse-trimmed",
-        definition: "relmse without the 0.1 % of the pixels that are worst",
+        definition: "relmse without the worst 0.1 % of the pixels",
         better: Better::Lower,
-        of: |c, r| Some(rel_mse_trimmed(c, r)),
+        measure: |c, r| Some(rel_mse_trimmed(c, r)),
     },
     Metric {
         name: "smape",
         definition: "mean over values of |c - r| / (|c| + |r| + 0.01) (KPCN)",
         better: Better::Lower,
-        of: |c, r| Some(smape(c, r)),
+        measure: |c, r| Some(smape(c, r)),
     },
     Metric {
         name: "psnr",
         definition: "-10 log10 of the mean squared error on clip(x, 0, 1)^(1/2.2), in dB; none for equal images",
         better: Better::Higher,
-        of: psnr,
+        measure: psnr,
     },
     Metric {
         name: "flip",
-        definition: "mean LDR-FLIP (Andersson et al. 2020) on clip(x, 0, 1)^(1/2.2), 67 pixels a degree",
+        definition: "mean LDR-FLIP (Andersson et al. 2020) on clip(x, 0, 1)^(1/2.2), 67 pixels per degree",
         better: Better::Lower,
-        of: |c, r| Some(flip(c, r)),
+        measure: |c, r| Some(flip(c, r)),
     },
     Metric {
         name: "energy-bias",
-        definition: "mean luminance of c by that of r, minus 1; none for a black reference",
+        definition: "mean luminance of c divided by that of r, minus 1; none for a black reference",
         better: Better::Zero,
-        of: energy_bias,
+        measure: energy_bias,
     },
 ];
 
@@ -163,7 +167,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_unique_and_found() {
+    fn names_are_unique_and_can_be_looked_up() {
         for metric in &METRICS {
             let found = find(metric.name).expect("a row");
             assert_eq!(found.definition, metric.definition);
@@ -172,7 +176,7 @@ mod tests {
         assert!(find("RelMSE").is_none());
     }
 
-    /// Every metric has its best value for the reference itself, and a worse one for a disturbed copy.
+    /// Every metric is best for the reference itself and worse for a disturbed copy.
     #[test]
     fn a_disturbed_copy_is_worse_than_the_reference() {
         let (height, width) = (64, 72);
@@ -187,11 +191,14 @@ mod tests {
         let image = |hdr| Image::new(hdr, height, width).expect("finite");
         let (r, c) = (image(&reference), image(&disturbed));
         for Metric {
-            name, better, of, ..
+            name,
+            better,
+            measure,
+            ..
         } in METRICS
         {
-            let worse = better.comparable(of(&c, &r).expect("a value"));
-            let same = of(&r, &r);
+            let worse = better.comparable(measure(&c, &r).expect("a value"));
+            let same = measure(&r, &r);
             match name {
                 "psnr" => assert_eq!(same, None, "infinite"),
                 _ => {

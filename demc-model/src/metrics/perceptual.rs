@@ -6,16 +6,16 @@ use rayon::prelude::*;
 use super::Image;
 use super::filter::add;
 
-/// Side of SSIM's Gaussian window, px.
+/// Side of SSIM's Gaussian window in pixels.
 pub const SSIM_WINDOW: usize = 11;
 
-/// Deviation of SSIM's Gaussian window, px.
+/// Standard deviation of SSIM's Gaussian window in pixels.
 const SSIM_SIGMA: f64 = 1.5;
 
 /// `ssim` of an image, -1 to 1; `None` for an image smaller than the 11 x 11 window.
 ///
 /// # Panics
-/// Where the sizes differ.
+/// If the sizes differ.
 pub fn ssim(candidate: &Image, reference: &Image) -> Option<f64> {
     candidate.assert_size_of(reference);
     let (height, width) = reference.size();
@@ -29,34 +29,34 @@ pub fn ssim(candidate: &Image, reference: &Image) -> Option<f64> {
     Some(sum / 3.0)
 }
 
-/// `psnr` in dB; `None` for images that are displayed alike, which would be infinite.
+/// `psnr` in dB; `None` for images with equal display values, where it is infinite.
 ///
 /// # Panics
-/// Where the sizes differ.
+/// If the sizes differ.
 pub fn psnr(candidate: &Image, reference: &Image) -> Option<f64> {
     candidate.assert_size_of(reference);
     let rows = candidate.display().par_chunks(candidate.size().1);
     let rows = rows.zip(reference.display().par_chunks(candidate.size().1));
     let squares = |(c, r): (&[f64], &[f64])| c.iter().zip(r).map(|(c, r)| (c - r).powi(2)).sum();
-    // Added in order: the same number on any number of threads.
-    let of_rows: Vec<f64> = rows.map(squares).collect();
-    let sum: f64 = of_rows.iter().sum();
+    // Summed in order, so that the result does not depend on the number of threads.
+    let row_sums: Vec<f64> = rows.map(squares).collect();
+    let sum: f64 = row_sums.iter().sum();
     (sum > 0.0).then(|| -10.0 * (sum / reference.display().len() as f64).log10())
 }
 
-/// What SSIM averages over a window: x, y, x^2, y^2 and xy.
+/// Number of moments that SSIM averages over a window: x, y, x^2, y^2 and xy.
 const MOMENTS: usize = 5;
 
-/// Mean over all windows that lie inside, of one channel. Row by row: nothing of the size of the image is stored.
+/// Mean of one channel over all windows inside the image. It works row by row and stores no plane.
 fn ssim_plane(x: &[f64], y: &[f64], width: usize) -> f64 {
     let taps = gaussian();
     let rows = x.len() / width + 1 - SSIM_WINDOW;
     let inner = width + 1 - SSIM_WINDOW;
     let buffers = || {
-        let of = |len: usize| [(); MOMENTS].map(|()| vec![0.0; len]);
-        (of(width), of(inner))
+        let moments = |len: usize| [(); MOMENTS].map(|()| vec![0.0; len]);
+        (moments(width), moments(inner))
     };
-    let of_rows: Vec<f64> = (0..rows)
+    let row_sums: Vec<f64> = (0..rows)
         .into_par_iter()
         .map_init(buffers, |(down, across), row| {
             down.iter_mut().for_each(|moment| moment.fill(0.0));
@@ -73,8 +73,8 @@ fn ssim_plane(x: &[f64], y: &[f64], width: usize) -> f64 {
             ssim_row(across)
         })
         .collect();
-    // Added in order: the same number on any number of threads.
-    of_rows.iter().sum::<f64>() / (rows * inner) as f64
+    // Summed in order, so that the result does not depend on the number of threads.
+    row_sums.iter().sum::<f64>() / (rows * inner) as f64
 }
 
 #[multiversion(targets("x86_64+avx512f", "x86_64+avx2"))]
@@ -92,7 +92,7 @@ fn add_moments(sums: &mut [Vec<f64>; MOMENTS], x: &[f64], y: &[f64], tap: f64) {
     }
 }
 
-/// Sum over a row of windows.
+/// Sum of SSIM over a row of windows.
 #[multiversion(targets("x86_64+avx512f", "x86_64+avx2"))]
 fn ssim_row([mean_x, mean_y, xx, yy, xy]: &[Vec<f64>; MOMENTS]) -> f64 {
     const C1: f64 = 0.01 * 0.01;
@@ -105,7 +105,7 @@ fn ssim_row([mean_x, mean_y, xx, yy, xy]: &[Vec<f64>; MOMENTS]) -> f64 {
     (0..mean_x.len()).map(window).sum()
 }
 
-/// The window of SSIM along one axis; it sums up to 1.
+/// SSIM's window along one axis; its sum is 1.
 pub(crate) fn gaussian() -> [f64; SSIM_WINDOW] {
     let centre = (SSIM_WINDOW / 2) as f64;
     let raw: [f64; SSIM_WINDOW] = std::array::from_fn(|i| {
@@ -137,9 +137,9 @@ mod tests {
     fn ssim_of_an_image_with_itself_is_one_and_symmetric_otherwise() {
         let (a, b) = (pattern(3 * 12 * 16, 3), pattern(3 * 12 * 16, 4));
         let (a, b) = (image(&a, 12, 16), image(&b, 12, 16));
-        let of = |x, y| ssim(x, y).expect("larger than the window");
-        assert!((of(&a, &a) - 1.0).abs() < 1e-12);
-        let (ab, ba) = (of(&a, &b), of(&b, &a));
+        let value = |x, y| ssim(x, y).expect("larger than the window");
+        assert!((value(&a, &a) - 1.0).abs() < 1e-12);
+        let (ab, ba) = (value(&a, &b), value(&b, &a));
         assert!(ab < 0.5 && (ab - ba).abs() < 1e-12);
     }
 
@@ -150,12 +150,12 @@ mod tests {
         let expected = (2.0 * x * y + 1e-4) / (x * x + y * y + 1e-4);
         let (a, b) = ([0.25; 3 * 11 * 11], [0.5; 3 * 11 * 11]);
         let found = ssim(&image(&a, 11, 11), &image(&b, 11, 11)).expect("one window");
-        // DISPLAY_GAMMA is a float32 2.2.
+        // DISPLAY_GAMMA is 2.2 in float32.
         assert!((found - expected).abs() < 1e-7, "{found} {expected}");
     }
 
     #[test]
-    fn ssim_has_no_value_below_its_window() {
+    fn ssim_is_undefined_for_an_image_smaller_than_its_window() {
         let hdr = [0.5; 3 * 10 * 20];
         let image = image(&hdr, 10, 20);
         assert_eq!(ssim(&image, &image), None);

@@ -2,17 +2,17 @@
 
 use super::{Image, LOSS_EPSILON};
 
-/// Pixels at each edge that `relmse@sbmc` leaves out, as SBMC's evaluation does.
+/// Number of pixels at each edge that `relmse@sbmc` leaves out, as SBMC's evaluation does.
 const SBMC_BORDER: usize = 21;
-/// One pixel in so many is left out of `relmse-trimmed`.
+/// `relmse-trimmed` leaves out one pixel in this number.
 const TRIMMED: usize = 1000;
-/// Luminance of linear Rec. 709.
+/// Luminance weights of linear Rec. 709.
 const LUMINANCE: [f64; 3] = [0.2126, 0.7152, 0.0722];
 
 /// `relmse` (Eq. 5).
 ///
 /// # Panics
-/// Where the sizes differ, as all functions of two images here.
+/// If the sizes differ; this holds for all functions of two images here.
 pub fn rel_mse(candidate: &Image, reference: &Image) -> f64 {
     candidate.assert_size_of(reference);
     rel_mse_image(candidate.hdr(), reference.hdr())
@@ -24,7 +24,7 @@ pub fn rel_mse(candidate: &Image, reference: &Image) -> f64 {
 /// Two planar `[3, H, W]` in linear HDR.
 ///
 /// # Panics
-/// Where the lengths differ or are not three planes.
+/// If the lengths differ or are not three planes.
 pub fn rel_mse_image(candidate_hdr: &[f32], reference_hdr: &[f32]) -> f64 {
     assert_eq!(
         candidate_hdr.len(),
@@ -41,7 +41,8 @@ pub fn rel_mse_afgsa(candidate: &Image, reference: &Image) -> f64 {
     0.5 * mean(candidate.hdr(), reference.hdr(), squared(0.01))
 }
 
-/// `relmse@sbmc`: mean over values inside a border of 21 pixels, epsilon 0.0001; `None` where nothing is inside.
+/// `relmse@sbmc`: mean over values inside a border of 21 pixels, epsilon 0.0001; `None` if no pixel
+/// is inside.
 pub fn rel_mse_sbmc(candidate: &Image, reference: &Image) -> Option<f64> {
     candidate.assert_size_of(reference);
     let (height, width) = reference.size();
@@ -61,7 +62,8 @@ pub fn rel_mse_sbmc(candidate: &Image, reference: &Image) -> Option<f64> {
     Some(sum / (3 * rows * columns) as f64)
 }
 
-/// `mrse@pbrt`: mean over values of `(c - r)^2 / (r + 0.01)^2`. pbrt skips infinite pixels; here there are none.
+/// `mrse@pbrt`: mean over values of `(c - r)^2 / (r + 0.01)^2`. pbrt skips infinite pixels; an
+/// [`Image`] has none.
 pub fn mrse_pbrt(candidate: &Image, reference: &Image) -> f64 {
     candidate.assert_size_of(reference);
     mean(candidate.hdr(), reference.hdr(), |c, r| {
@@ -87,7 +89,8 @@ pub fn smape(candidate: &Image, reference: &Image) -> f64 {
     })
 }
 
-/// `energy-bias`: mean luminance by that of the reference, minus 1; `None` for a black reference.
+/// `energy-bias`: mean luminance divided by that of the reference, minus 1; `None` for a black
+/// reference.
 pub fn energy_bias(candidate: &Image, reference: &Image) -> Option<f64> {
     candidate.assert_size_of(reference);
     let luminance = |image: &Image| -> f64 {
@@ -100,7 +103,7 @@ pub fn energy_bias(candidate: &Image, reference: &Image) -> Option<f64> {
     (expected > 0.0).then(|| luminance(candidate) / expected - 1.0)
 }
 
-/// The error of each pixel whose mean is `relmse`.
+/// The error of each pixel. Its mean is `relmse`.
 ///
 /// # Shapes
 /// `[H, W]`.
@@ -109,9 +112,9 @@ pub fn rel_mse_map(candidate: &Image, reference: &Image) -> Vec<f64> {
     let pixels = reference.pixels();
     let term = squared(LOSS_EPSILON.into());
     let (c, r) = (candidate.hdr(), reference.hdr());
-    let of = |i: usize| term(c[i].into(), r[i].into());
+    let error = |i: usize| term(c[i].into(), r[i].into());
     (0..pixels)
-        .map(|i| of(i) + of(pixels + i) + of(2 * pixels + i))
+        .map(|i| error(i) + error(pixels + i) + error(2 * pixels + i))
         .collect()
 }
 
@@ -136,19 +139,19 @@ mod tests {
 
     #[test]
     fn rel_mse_sums_over_channels_and_divides_by_pixels() {
-        // Two pixels; errors of 1 against references of 1: six terms of 1 / 1.001 over two pixels.
+        // Two pixels with errors of 1 and references of 1: six terms of 1 / 1.001 over two pixels.
         let (candidate, reference) = ([2.0; 6], [1.0; 6]);
         let expected = 3.0 / 1.001;
         assert!((rel_mse_image(&candidate, &reference) - expected).abs() < 1e-6);
     }
 
     #[test]
-    fn black_image_scores_nearly_three() {
+    fn relmse_of_a_black_image_is_nearly_three() {
         assert!((rel_mse_image(&[0.0; 12], &[10.0; 12]) - 3.0).abs() < 1e-4);
     }
 
     #[test]
-    fn constants_give_the_formulas_by_hand() {
+    fn constant_images_give_hand_computed_values() {
         let (c, r) = ([3.0; 3 * 50 * 50], [1.0; 3 * 50 * 50]);
         let (c, r) = (image(&c, 50, 50), image(&r, 50, 50));
         let near = |found: f64, expected: f64| {
@@ -192,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn a_black_reference_has_no_energy() {
+    fn energy_bias_is_undefined_for_a_black_reference() {
         let black = [0.0; 12];
         assert_eq!(
             energy_bias(&image(&[1.0; 12], 2, 2), &image(&black, 2, 2)),

@@ -1,16 +1,16 @@
-//! Feature maps on their way through the network.
+//! Feature maps and the operations on them: by our kernels or by Burn's tensor operations.
 
 use burn::module::RunningState;
 use burn::nn::BatchNorm;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
-use burn::tensor::Tensor;
+use burn::tensor::{Tensor, activation, module::max_pool2d, ops::MaxPoolOptions};
 
-use super::{Ops, kernels, stock};
+use super::{Ops, kernels};
 
-/// What follows an operation.
+/// The activation after an operation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Activation {
-    /// Nothing.
+    /// The identity.
     None,
     /// `max(x, 0)`, fused into the operation by the kernels.
     Relu,
@@ -20,21 +20,29 @@ impl Activation {
     pub(super) fn is_relu(self) -> bool {
         self == Activation::Relu
     }
+
+    fn apply(self, x: Tensor<4>) -> Tensor<4> {
+        match self {
+            Activation::None => x,
+            Activation::Relu => activation::relu(x),
+        }
+    }
 }
 
 /// A batch of feature maps, `[B, C, H, W]` in the paper's terms.
 ///
-/// The kernels keep channels last, `[B, H, W, C]` and contiguous: in the shape of the tensor and not in its strides, so that
-/// what Burn itself does with it (the sum of two gradients) runs on contiguous memory. Burn's operations keep `[B, C, H, W]`.
+/// For the kernels the tensor is `[B, H, W, C]` and contiguous. Its shape has the channels last,
+/// not only its strides, so that Burn's own work on it (the sum of two gradients) runs on
+/// contiguous memory. For Burn's operations the tensor is `[B, C, H, W]`.
 #[derive(Clone, Debug)]
 pub struct Maps {
     tensor: Tensor<4>,
-    /// Those that run on the tensor's device.
+    /// The operations that run on the tensor's device.
     ops: Ops,
 }
 
 impl Maps {
-    /// Maps to work on with `ops`, or with Burn's operations where the tensor's device has no kernels.
+    /// Maps that use `ops`, or Burn's operations if the tensor's device has no kernels.
     ///
     /// # Shapes
     /// `[B, C, H, W]`.
@@ -47,7 +55,7 @@ impl Maps {
         Maps { tensor, ops }
     }
 
-    /// The maps as Burn has them.
+    /// The maps as a tensor in Burn's layout.
     ///
     /// # Shapes
     /// `[B, C, H, W]`.
@@ -67,12 +75,12 @@ impl Maps {
         }
     }
 
-    /// The operations that run here.
+    /// The operations that run on these maps.
     pub fn ops(&self) -> Ops {
         self.ops
     }
 
-    /// A 3x3 convolution with padding 1 and its bias.
+    /// A 3x3 convolution with padding 1 and a bias.
     ///
     /// # Shapes
     /// `[B, in, H, W]` to `[B, out, H, W]`.
@@ -82,12 +90,12 @@ impl Maps {
                 let (weight, bias) = conv_parameters(conv);
                 kernels::conv3x3(self.tensor, weight, bias, activation)
             }
-            Ops::Burn => stock::conv(self.tensor, conv, activation),
+            Ops::Burn => activation.apply(conv.forward(self.tensor)),
         };
         Maps { tensor, ..self }
     }
 
-    /// A 4x4 deconvolution with stride 2 and padding 1 and its bias: exactly twice the size.
+    /// A 4x4 deconvolution with stride 2, padding 1 and a bias: exactly twice the size.
     ///
     /// # Shapes
     /// `[B, in, H, W]` to `[B, out, 2H, 2W]`.
@@ -97,18 +105,19 @@ impl Maps {
                 let bias = deconv.bias.as_ref().expect("a deconvolution has a bias");
                 kernels::deconv4x4(self.tensor, deconv.weight.val(), bias.val(), activation)
             }
-            Ops::Burn => stock::deconv(self.tensor, deconv, activation),
+            Ops::Burn => activation.apply(deconv.forward(self.tensor)),
         };
         Maps { tensor, ..self }
     }
 
-    /// The 1x1 convolution, with bias, of the concatenation of `parts` (Eq. 2), which the kernels never make.
+    /// The 1x1 convolution, with bias, of the concatenation of `parts` (Eq. 2). The kernels do not
+    /// store the concatenation.
     ///
     /// # Shapes
     /// `[B, K_i, H, W]` to `[B, out, H, W]`; the convolution has the sum of the `K_i` as input.
     ///
     /// # Panics
-    /// Where the kernels run and there are not two or three parts.
+    /// If the kernels run and the number of parts is not two or three.
     pub fn fuse(parts: Vec<Maps>, conv: &Conv2d, activation: Activation) -> Self {
         let (tensors, ops) = split(parts);
         let tensor = match ops {
@@ -116,13 +125,13 @@ impl Maps {
                 let (weight, bias) = conv_parameters(conv);
                 kernels::fuse(tensors, weight, bias, activation)
             }
-            Ops::Burn => stock::conv(Tensor::cat(tensors, 1), conv, activation),
+            Ops::Burn => activation.apply(conv.forward(Tensor::cat(tensors, 1))),
         };
         Maps { tensor, ops }
     }
 
-    /// Batch normalisation: with the batch's statistics on a device with autodiff, whose running ones it updates;
-    /// with the running ones elsewhere.
+    /// Batch normalisation. A device with autodiff uses the statistics of the batch and updates the
+    /// running ones; a device without autodiff uses the running ones.
     ///
     /// # Shapes
     /// `[B, C, H, W]` to the same.
@@ -139,29 +148,29 @@ impl Maps {
                 update(&norm.running_var, variance, norm.momentum);
                 y
             }
-            // Frozen in a network that trains: no kernel has that gradient.
+            // A frozen normalisation under autodiff: no kernel has that gradient.
             Ops::Kernels => {
-                let y = stock::batch_norm(self.into_nchw(), norm, activation);
+                let y = activation.apply(norm.forward(self.into_nchw()));
                 return Maps::from_nchw(y, ops);
             }
-            Ops::Burn => stock::batch_norm(self.tensor, norm, activation),
+            Ops::Burn => activation.apply(norm.forward(self.tensor)),
         };
         Maps { tensor, ops }
     }
 
-    /// 2x2 max-pooling with stride 2. A gradient goes to the first of several largest values.
+    /// 2x2 max-pooling with stride 2. Of several equal maxima, the first receives the gradient.
     ///
     /// # Shapes
     /// `[B, C, H, W]` to `[B, C, H / 2, W / 2]`.
     pub fn max_pool(self) -> Self {
         let tensor = match self.ops {
             Ops::Kernels => kernels::max_pool(self.tensor),
-            Ops::Burn => stock::max_pool(self.tensor),
+            Ops::Burn => max_pool2d(self.tensor, MaxPoolOptions::new([2, 2])),
         };
         Maps { tensor, ..self }
     }
 
-    /// The channels of all parts, one after another.
+    /// The concatenation of all parts over channels.
     ///
     /// # Shapes
     /// `[B, K_i, H, W]` to `[B, sum of K_i, H, W]`.
@@ -179,10 +188,13 @@ impl Maps {
     }
 }
 
-/// The tensors of `parts` and the operations that run on them all.
+/// The tensors of `parts` and the operations that run on them.
 fn split(parts: Vec<Maps>) -> (Vec<Tensor<4>>, Ops) {
     let ops = parts.first().expect("at least one part").ops;
-    assert!(parts.iter().all(|part| part.ops == ops), "maps of one kind");
+    assert!(
+        parts.iter().all(|part| part.ops == ops),
+        "all parts use the same operations"
+    );
     (parts.into_iter().map(|part| part.tensor).collect(), ops)
 }
 
@@ -191,7 +203,7 @@ fn conv_parameters(conv: &Conv2d) -> (Tensor<4>, Tensor<1>) {
     (conv.weight.val(), bias.val())
 }
 
-/// Takes a batch's statistic into the running one, as `burn::nn::BatchNorm` does.
+/// Updates a running statistic by that of a batch, as `burn::nn::BatchNorm` does.
 fn update(running: &RunningState<Tensor<1>>, batch: Tensor<1>, momentum: f64) {
     let old = running.value_sync().mul_scalar(1.0 - momentum);
     let new = old.add(batch.detach().mul_scalar(momentum));

@@ -1,24 +1,19 @@
-//! The operations of the network, twice: our CPU kernels (`demc-kernels`) and Burn's own tensor operations.
+//! The operations of the network, implemented twice: our CPU kernels (`demc-kernels`) and Burn's
+//! own.
 //!
-//! [`Ops`] says which of them a network asks for. The kernels know Burn's CPU backend `flex` only, so on every other
-//! device Burn's own run, whatever was asked for. Modules never see the difference: they work on [`Maps`], which hold
-//! feature maps in the layout that the running implementation likes, and nothing outside this folder branches on it.
+//! [`Ops`] is the implementation that a network asks for. The kernels support Burn's CPU backend
+//! `flex`; every other device runs Burn's operations. Modules work on [`Maps`] and need not know
+//! which one runs. Only this folder matches on [`Ops`].
 //!
-//! | file | holds |
-//! |---|---|
-//! | `maps` | [`Maps`], what the modules call |
-//! | `kernels/` | the kernels as a Burn backend extension for `flex`, with gradients |
-//! | `stock` | the same operations made of Burn's |
-//! | `adam` | the optimizer's step and the norm of a gradient, in place where the kernels run |
-//! | `muon` | the other optimizer's step |
-//! | `average` | the moving average of weights, likewise |
+//! - `maps`: [`Maps`], the feature maps that the modules compute with
+//! - `kernels/`: the kernels as a Burn backend extension for `flex`, with gradients
+//! - [`update`]: updates of the weights: Adam's step, the gradient's norm, the moving average
+//! - [`muon`]: Muon's step
 
-pub mod adam;
-pub mod average;
 mod kernels;
 mod maps;
 pub mod muon;
-mod stock;
+pub mod update;
 
 use std::fmt;
 use std::str::FromStr;
@@ -33,33 +28,33 @@ use thiserror::Error;
 
 pub use maps::{Activation, Maps};
 
-/// Which operations a network asks for.
+/// The implementation of the operations that a network asks for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum Ops {
-    /// The kernels of `demc-kernels` where the device is `flex`, Burn's elsewhere.
+    /// The kernels of `demc-kernels` on `flex`, Burn's operations on all other devices.
     #[default]
     Kernels,
-    /// Burn's own everywhere.
+    /// Burn's operations on all devices.
     Burn,
 }
 
-/// A name that is none of [`Ops`].
+/// An unknown name of [`Ops`].
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
-#[error("operations `{name}` are unknown; there are: kernels, burn")]
+#[error("unknown operations `{name}`: expected kernels or burn")]
 pub struct UnknownOps {
-    /// What was asked for.
+    /// The name.
     pub name: String,
 }
 
-/// Whether networks are built with Burn's operations, where nothing else is said.
+/// Whether new networks use Burn's operations by default.
 static DEFAULT_IS_BURN: AtomicBool = AtomicBool::new(false);
 
-/// Makes `ops` what the networks built from now on in this process ask for.
+/// Sets the operations of all networks that this process builds from now on.
 pub fn set_default(ops: Ops) {
     DEFAULT_IS_BURN.store(ops == Ops::Burn, Ordering::Relaxed);
 }
 
-/// What a network asks for where nothing else is said: the kernels, until [`set_default`] is called.
+/// The operations of a new network: the kernels, until [`set_default`] is called.
 pub fn process_default() -> Ops {
     match DEFAULT_IS_BURN.load(Ordering::Relaxed) {
         true => Ops::Burn,
@@ -68,10 +63,10 @@ pub fn process_default() -> Ops {
 }
 
 impl Ops {
-    /// Both.
+    /// Both implementations.
     pub const ALL: [Ops; 2] = [Ops::Kernels, Ops::Burn];
 
-    /// Name in switches and reports.
+    /// The name in command-line options and reports.
     pub fn name(self) -> &'static str {
         match self {
             Ops::Kernels => "kernels",
@@ -79,7 +74,7 @@ impl Ops {
         }
     }
 
-    /// What runs on `device` where these are asked for.
+    /// The operations that run on `device` for a network that asks for these.
     pub fn on(self, device: &Device) -> Ops {
         // Devices compare without regard to autodiff.
         match *device == Device::flex() {
@@ -88,7 +83,12 @@ impl Ops {
         }
     }
 
-    /// What runs on `device`, in words: `kernels on avx512`, or `Burn's operations`.
+    /// Whether these operations have the inference pass on slices ([`crate::inference`]).
+    pub fn has_fast_inference(self) -> bool {
+        self == Ops::Kernels
+    }
+
+    /// The operations that run on `device`, in words: `kernels on avx512` or `Burn's operations`.
     pub fn describe(self, device: &Device) -> String {
         match self.on(device) {
             Ops::Kernels => format!("kernels on {}", Isa::current()),
@@ -112,11 +112,11 @@ impl FromStr for Ops {
     }
 }
 
-/// RelMSE (Eq. 5) of each image of a network's output in gamma space against a reference in linear HDR; see
-/// [`Loss`](crate::Loss).
+/// RelMSE (Eq. 5) of each image: `1/N sum (ref - out)^2 / (ref^2 + epsilon)` in linear HDR, N the
+/// number of pixels.
 ///
 /// # Shapes
-/// Two `[B, 3, H, W]` to `[B]`.
+/// `out_gamma` in gamma space and `ref_hdr` in linear HDR, both `[B, 3, H, W]`, to `[B]`.
 pub(crate) fn rel_mse_of_gamma(
     ops: Ops,
     out_gamma: Tensor<4>,
@@ -126,8 +126,25 @@ pub(crate) fn rel_mse_of_gamma(
 ) -> Tensor<1> {
     match ops.on(&out_gamma.device()) {
         Ops::Kernels => kernels::rel_mse_of_gamma(out_gamma, ref_hdr, gamma, epsilon),
-        Ops::Burn => stock::rel_mse_of_gamma(out_gamma, ref_hdr, gamma, epsilon),
+        Ops::Burn => {
+            let [_, channels, ..] = out_gamma.dims();
+            let difference = out_gamma.powf_scalar(gamma) - ref_hdr.clone();
+            let relative = difference.square() / ref_hdr.square().add_scalar(epsilon);
+            mean_per_image(relative).mul_scalar(channels as f32)
+        }
     }
+}
+
+/// The mean of each image.
+///
+/// # Shapes
+/// `[B, C, H, W]` to `[B]`.
+pub(crate) fn mean_per_image(images: Tensor<4>) -> Tensor<1> {
+    let [batch, ..] = images.dims();
+    images
+        .reshape([batch as isize, -1])
+        .mean_dim(1)
+        .reshape([-1])
 }
 
 #[cfg(test)]
@@ -135,14 +152,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_parse_back_and_unknown_ones_list_what_exists() {
+    fn names_parse_back_and_an_unknown_name_lists_the_known_ones() {
         for ops in Ops::ALL {
             assert_eq!(ops.to_string().parse(), Ok(ops));
         }
         let message = "cpu".parse::<Ops>().expect_err("unknown").to_string();
         assert_eq!(
             message,
-            "operations `cpu` are unknown; there are: kernels, burn"
+            "unknown operations `cpu`: expected kernels or burn"
         );
     }
 

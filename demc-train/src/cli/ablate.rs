@@ -1,40 +1,41 @@
-//! `demc-train ablate`: which variant is better, and by how much.
+//! `demc-train ablate`: compares variants.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Args;
-use demc_train::ablation::{self, Ended, Spec};
-use demc_train::progress::say;
+use demc_train::record::progress::say;
+use demc_train::tools::ablation::spec::AblationSpec;
+use demc_train::tools::ablation::{self, AblationOutcome};
 
-use super::{ComputeArguments, stopped};
+use super::compute::{ComputeArguments, stopped};
 
-/// Train variants alike, from several seeds each, and compare them on the test split
+/// Train variants with several seeds each and compare them on the test split
 ///
-/// The file names a base configuration, seeds and variants (see configs/ablation.toml). Complete runs are not trained again
-/// and one that was stopped goes on, so the same command continues an ablation. It ends with ablation.md, .csv, .json, .svg
-/// and .png in the ablation's directory.
+/// The file names a base configuration, seeds and variants (see configs/ablation.toml). Rerun the
+/// command to resume an ablation: complete runs are not repeated. Writes ablation.md, .csv, .json
+/// and .svg to the directory of the ablation.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// The ablation
+    /// File of the ablation
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
 
-    /// Directory of the runs and of the result, instead of the file's
+    /// Directory of the runs and the results, instead of dir in the file
     #[arg(short, long, value_name = "DIR")]
     run_dir: Option<PathBuf>,
 
     #[command(flatten)]
     compute: ComputeArguments,
 
-    /// Change a key of every variant's configuration, such as train.steps=1000; can be given several times
+    /// Override a key of every variant, such as train.steps=1000; KEY= removes it; can be repeated
     #[arg(short, long, value_name = "KEY=VALUE")]
     set: Vec<String>,
 }
 
-/// Trains and compares.
+/// Trains and compares the variants.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
-    let mut spec = Spec::load(&arguments.config, &arguments.set)?;
+    let mut spec = AblationSpec::load(&arguments.config, &arguments.set)?;
     if let Some(dir) = arguments.run_dir {
         spec.dir = dir;
     }
@@ -42,7 +43,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     for variant in &spec.variants {
         let model = &variant.config.model;
         say(format!(
-            "{}: {model}, {} parameters, {:.0} GFLOP for a megapixel",
+            "{}: {model}, {} parameters, {:.0} GFLOP per megapixel",
             variant.name,
             model.parameter_count(),
             model.flops_per_pixel() / 1e3
@@ -52,8 +53,10 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         say(format!("note: not only the network differs: {difference}"));
     }
     match ablation::run(&spec, &device, &arguments.compute.device)? {
-        Ended::Stopped { signal, step } => Ok(stopped(signal, step, "the same command goes on")),
-        Ended::Done(comparison) => {
+        AblationOutcome::Stopped { signal, step } => {
+            Ok(stopped(signal, step, "rerun the command to resume"))
+        }
+        AblationOutcome::Done(comparison) => {
             let paths = ablation::write(&comparison, &spec.dir)?;
             say(format!("\n{}", ablation::markdown(&comparison)));
             for path in paths {

@@ -1,22 +1,22 @@
-//! `demc-train find-lr`: what learning rate to start with.
+//! `demc-train find-lr`: suggests an initial learning rate.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
 use demc_train::config::Config;
-use demc_train::data::Data;
-use demc_train::find_lr::{Range, sweep};
-use demc_train::progress::{Progress, say};
+use demc_train::record::progress::{StepProgress, say};
+use demc_train::run::data::RunData;
+use demc_train::tools::find_lr::{RateRange, sweep};
 
-use super::ComputeArguments;
+use super::compute::ComputeArguments;
 
-/// Find a learning rate: train the network that the run begins with while the rate climbs, and stop when the loss diverges
+/// Find a learning rate: train with a rising rate until the loss diverges
 ///
-/// Writes every step to STEM.csv and a picture to STEM.svg and STEM.png. No run directory is touched.
+/// Writes every step to STEM.csv and a chart to STEM.svg. No run directory is touched.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Configuration of the run that the rate is for
+    /// Configuration of the run
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
 
@@ -24,38 +24,39 @@ pub struct Arguments {
     #[arg(long, value_name = "RATE", default_value_t = 1e-6)]
     from: f64,
 
-    /// Last learning rate, if nothing diverges before
+    /// Last learning rate, unless the loss diverges before
     #[arg(long, value_name = "RATE", default_value_t = 1.0)]
     to: f64,
 
-    /// Steps from the one to the other
+    /// Number of steps
     #[arg(long, value_name = "N", default_value_t = 300)]
     steps: usize,
 
-    /// Files to write, without ending (default: runs/find-lr/ and the configuration's name)
+    /// Output files without extension (default: runs/find-lr/ and the configuration's name)
     #[arg(short, long, value_name = "STEM")]
     out: Option<PathBuf>,
 
     #[command(flatten)]
     compute: ComputeArguments,
 
-    /// Change a key of the configuration, such as model.width=32; can be given several times
+    /// Override a key of the configuration, such as model.width=32; KEY= removes it; can be
+    /// repeated
     #[arg(short, long, value_name = "KEY=VALUE")]
     set: Vec<String>,
 }
 
-/// Sweeps.
+/// Runs the sweep and prints its suggestion.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let Arguments {
         from, to, steps, ..
     } = arguments;
     anyhow::ensure!(
         from > 0.0 && from < to && to.is_finite() && steps >= 10,
-        "--from {from} --to {to} --steps {steps}: the rates must be positive and climb, in 10 steps or more"
+        "--from {from} --to {to} --steps {steps}: expected positive, rising rates and at least 10 steps"
     );
     let config = Config::load(&arguments.config, &arguments.set)?;
     let device = arguments.compute.device()?;
-    let data = Data::open(&config.data, config.train.seed)?;
+    let data = RunData::open(&config)?;
     say(format!(
         "data: {} in {}",
         data.summary(),
@@ -66,9 +67,9 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         .out
         .unwrap_or_else(|| Path::new("runs/find-lr").join(name));
     let per_step = config.patches_per_step();
-    let progress = Progress::new(0, steps as u64, per_step, data.train.len());
+    let progress = StepProgress::new(0, steps as u64, per_step, data.train.len());
     let mut done = 0;
-    let range = Range { from, to, steps };
+    let range = RateRange { from, to, steps };
     let found = sweep(&config, &data, range, &device, |point| {
         done += 1;
         progress.step(done, point.loss);
@@ -83,9 +84,9 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     }
     match found.suggestion() {
         Some(lr) => say(format!(
-            "suggestion: --set train.lr_start={lr:e}, a tenth of where the loss was smallest"
+            "suggestion: --set optimizer.lr_start={lr:e}, a tenth of the rate with the smallest loss"
         )),
-        None => say("the loss never fell below that of the untrained network: no suggestion"),
+        None => say("no suggestion: the loss never fell below that of the untrained network"),
     }
     for path in found.write(&stem)? {
         say(path.display());

@@ -1,27 +1,22 @@
-//! The command line: one verb a file, training where no verb is given.
+//! The command line: one file per subcommand; training is the default.
 
 mod ablate;
+mod compute;
 mod find_lr;
 mod plot;
 mod train;
 
-use std::path::Path;
 use std::process::ExitCode;
 
-use burn::tensor::Device;
-use clap::{Args, Parser, Subcommand};
-use demc_infer::compute::ComputeFlags;
-use demc_infer::device;
-use demc_train::progress::say;
-use demc_train::signals;
+use clap::{Parser, Subcommand};
 
 /// Train a DEMC Monte Carlo denoiser on rendered images.
 ///
-/// The configuration is a TOML file with the tables [model], [data], [train] and [run]; configs/demc.toml names every
-/// key. The run directory keeps the resolved configuration, metrics.jsonl, TensorBoard events, checkpoints, the best
-/// weights and pictures; `demc-infer --model RUN_DIR` uses it as it is.
+/// The configuration is a TOML file; configs/demc.toml lists every key with its default. The run
+/// directory contains the resolved configuration, metrics.jsonl, TensorBoard events, checkpoints,
+/// the best weights and pictures. `demc-infer --model RUN_DIR` uses its weights.
 ///
-/// Ctrl-C saves and stops, and --resume goes on; a second Ctrl-C stops at once.
+/// Ctrl-C saves a checkpoint and stops; --resume resumes the run. A second Ctrl-C stops at once.
 #[derive(Debug, Parser)]
 #[command(
     version,
@@ -31,36 +26,17 @@ use demc_train::signals;
 )]
 pub struct Arguments {
     #[command(subcommand)]
-    verb: Option<Verb>,
+    subcommand: Option<SubcommandArguments>,
 
     #[command(flatten)]
     train: train::Arguments,
 }
 
 #[derive(Debug, Subcommand)]
-enum Verb {
+enum SubcommandArguments {
     FindLr(find_lr::Arguments),
     Ablate(ablate::Arguments),
     Plot(plot::Arguments),
-}
-
-/// Where and with what to compute.
-#[derive(Debug, Args)]
-struct ComputeArguments {
-    /// Where to compute: flex (CPU), or ndarray, wgpu[:N], cuda[:N] in a build with that feature
-    #[arg(short, long, value_name = "DEVICE", default_value = "flex")]
-    device: String,
-
-    #[command(flatten)]
-    flags: ComputeFlags,
-}
-
-impl ComputeArguments {
-    /// The device, without autodiff; operations and instructions are set for the process.
-    fn device(&self) -> anyhow::Result<Device> {
-        self.flags.apply()?;
-        Ok(device::parse(&self.device)?)
-    }
 }
 
 const EXAMPLES: &str = "\
@@ -74,25 +50,10 @@ Examples:
 
 /// Runs the program.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
-    match arguments.verb {
-        Some(Verb::FindLr(arguments)) => find_lr::run(arguments),
-        Some(Verb::Ablate(arguments)) => ablate::run(arguments),
-        Some(Verb::Plot(arguments)) => plot::run(arguments),
+    match arguments.subcommand {
+        Some(SubcommandArguments::FindLr(arguments)) => find_lr::run(arguments),
+        Some(SubcommandArguments::Ablate(arguments)) => ablate::run(arguments),
+        Some(SubcommandArguments::Plot(arguments)) => plot::run(arguments),
         None => train::run(arguments.train),
     }
-}
-
-/// The edit that gives a run another directory.
-fn run_dir_set(dir: &Path) -> String {
-    let dir = toml::Value::String(dir.to_string_lossy().into_owned());
-    format!("run.dir={dir}")
-}
-
-/// Says that a signal ended the run after this step and how to go on; gives the exit code.
-fn stopped(signal: i32, step: u64, how: &str) -> ExitCode {
-    say(format!(
-        "\n{}: stopped after step {step}, everything is saved; {how} from there",
-        signals::name(signal)
-    ));
-    ExitCode::from(u8::try_from(signals::exit_code(signal)).unwrap_or(1))
 }

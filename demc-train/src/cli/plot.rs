@@ -1,27 +1,27 @@
-//! `demc-train plot`: the curves of runs.
+//! `demc-train plot`: draws the curves of runs.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Args;
-use demc_train::plot::{PlotOptions, plot};
-use demc_train::progress::say;
+use demc_train::record::progress::say;
+use demc_train::tools::plot::{PlotOptions, plot};
 
-/// Draw loss and validation curves of one or many runs to SVG and PNG
+/// Draw loss and validation curves of one or more runs as SVG
 ///
-/// Panels over the steps: training loss (smoothed, the raw values pale beneath), and validation RelMSE and SSIM where a run has any.
-/// A run that is still going can be drawn at any time.
+/// Panels: training loss (smoothed, raw values in a pale colour), validation RelMSE and SSIM. A run
+/// in progress can be drawn too.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Run directories
     #[arg(required = true, value_name = "RUN")]
     runs: Vec<PathBuf>,
 
-    /// Files to write, without ending (default: curves in the first run)
+    /// Output file without extension (default: curves in the first run)
     #[arg(short, long, value_name = "STEM")]
     out: Option<PathBuf>,
 
-    /// How much of the training loss's curve comes from the lines before, 0 to below 1
+    /// Smoothing of the training loss: weight of earlier values, 0 to below 1
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.9)]
     smooth: f64,
 
@@ -30,7 +30,7 @@ pub struct Arguments {
     linear: bool,
 }
 
-/// Draws.
+/// Draws the curves.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let Arguments {
         runs,
@@ -39,7 +39,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         linear,
     } = arguments;
     let stem = out.unwrap_or_else(|| runs[0].join("curves"));
-    let [svg, png] = plot(&runs, &stem, &PlotOptions { smooth, linear })?;
-    say(format!("{}\n{}", svg.display(), png.display()));
+    let path = plot(&runs, &stem, &PlotOptions { smooth, linear })?;
+    say(path.display());
     Ok(ExitCode::SUCCESS)
 }

@@ -1,56 +1,64 @@
-//! Training: flags to a resolved configuration, and what is printed around a run.
+//! Training: the default of `demc-train`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
 use demc_train::config::Config;
-use demc_train::progress::say;
-use demc_train::session::{Manner, Outcome, Session};
+use demc_train::record::progress::say;
+use demc_train::run::session::{Session, SessionOptions, SessionOutcome};
 
-use super::{ComputeArguments, run_dir_set, stopped};
+use super::compute::{ComputeArguments, stopped};
 
-/// What a training is told.
+/// Arguments of a training.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Configuration of the run
-    // Optional beside a verb alone.
+    // Absent only with a subcommand.
     #[arg(short, long, value_name = "FILE", required = true)]
     config: Option<PathBuf>,
 
-    /// Directory of the run, instead of the configuration's run.dir (default: runs/ and the configuration's name)
+    /// Run directory, instead of run.dir in the configuration (default: runs/ and the
+    /// configuration's name)
     #[arg(short, long, value_name = "DIR")]
     run_dir: Option<PathBuf>,
 
-    /// Continue the run in the run directory from its latest checkpoint, bit for bit
+    /// Resume the run in the run directory from its latest checkpoint, bit for bit
     #[arg(long)]
     resume: bool,
 
     #[command(flatten)]
     compute: ComputeArguments,
 
-    /// Change a key of the configuration, such as train.steps=1000; can be given several times
+    /// Override a key of the configuration, such as train.steps=1000; KEY= removes it; can be
+    /// repeated
     #[arg(short, long, value_name = "KEY=VALUE")]
     set: Vec<String>,
 
-    /// Check configuration and data, tell how long the run will take, and stop; nothing is written
+    /// Check configuration and data and print the estimated duration; writes nothing
     #[arg(long)]
     check: bool,
 }
 
-/// Trains, or goes on.
+/// The edit that sets the run directory.
+fn run_dir_set(dir: &Path) -> String {
+    let dir = toml::Value::String(dir.to_string_lossy().into_owned());
+    format!("run.dir={dir}")
+}
+
+/// Trains a run, new or resumed.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let mut sets = arguments.set;
     sets.extend(arguments.run_dir.as_deref().map(run_dir_set));
-    let config = arguments.config.expect("clap asks for it");
+    let config = arguments.config.expect("clap requires it");
     let config = Config::load(&config, &sets)?;
     let device = arguments.compute.device()?;
-    let manner = Manner {
+    let options = SessionOptions {
         resume: arguments.resume,
         check: arguments.check,
     };
-    let (root, dir) = (config.data.root.clone(), config.run.dir.clone());
-    let session = Session::open(config, manner, &device, &arguments.compute.device)?;
+    let (root, dir) = (config.data.root.clone(), config.run_dir().to_path_buf());
+    let session = Session::open(config, options, &device, &arguments.compute.device)?;
     say(format!("demc-train: {}", session.headline()));
     say(format!("\n{}", session.run().config().to_toml()));
     say(format!("data: {} in {}", session.data, root.display()));
@@ -63,21 +71,28 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         run.parameters()
     ));
     say(format!(
-        "patches: {} an epoch, {} a step",
+        "patches: {} per epoch, {} per step",
         run.patches(),
-        run.patches_per_step()
+        run.config().patches_per_step()
     ));
     if arguments.check {
-        say("check: all is well; nothing was written");
+        say("check: configuration and data are valid; nothing was written");
         return Ok(ExitCode::SUCCESS);
     }
     say(format!("run: {}\n", dir.display()));
     match session.finish()? {
-        Outcome::Stopped { signal, step } => return Ok(stopped(signal, step, "--resume goes on")),
-        Outcome::Scored(Some((step, report))) => {
-            say(format!("\nTest split, weights of step {step}:\n\n{report}"));
+        SessionOutcome::Stopped { signal, step } => {
+            return Ok(stopped(signal, step, "--resume resumes the run"));
         }
-        Outcome::Scored(None) => say("\nThe data set has no test split: nothing to score."),
+        SessionOutcome::Complete { kept, scores } => {
+            say(format!("\n{kept}"));
+            match scores {
+                Some((step, report)) => {
+                    say(format!("\nTest split, weights of step {step}:\n\n{report}"));
+                }
+                None => say("\nNo scores: the data set has no test split."),
+            }
+        }
     }
     say(format!("\nweights, pictures and scores: {}", dir.display()));
     Ok(ExitCode::SUCCESS)

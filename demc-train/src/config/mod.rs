@@ -1,43 +1,53 @@
-//! The configuration of a run: one TOML file with the tables `[model]`, `[data]`, `[train]` and `[run]`.
+//! The configuration of a run: one TOML file with the tables `[model]`, `[data]`, `[loss]`,
+//! `[optimizer]`, `[train]` and `[run]`.
 //!
-//! Strict: an unknown key, a wrong type or a value out of range stops the run before it starts, and every problem is
-//! named at once. `--set table.key=value` edits the file's tree before it is parsed. Paths are relative to the current
-//! directory; the resolved configuration, saved with the run, holds absolute ones.
+//! An unknown key, a wrong type or a value out of range stops the run before it starts; all of them
+//! are named at once. `--set table.key=value` edits the file's tree before it is parsed. Paths are
+//! relative to the current directory. The resolved configuration, saved with the run, holds
+//! absolute paths.
 
+mod first_edition;
+mod optimizer;
+mod problems;
+mod run;
 mod source;
-mod tables;
+mod train;
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use demc_data::DataConfig;
-use demc_model::{ModelConfig, Variant};
+use demc_model::{LossConfig, ModelConfig, Variant};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
+use toml::Value;
 
-use crate::schedule::LearningRate;
+use crate::step::schedule::LearningRate;
+pub use optimizer::{OptimizerConfig, OptimizerKind};
+pub use run::RunConfig;
 pub(crate) use source::one_line;
-pub use tables::{OnNan, RunConfig, TrainConfig};
+pub use train::{OnNan, TrainConfig};
 
-/// More steps than this are a slip of the keyboard: the paper's run is 250,000.
-const MOST_STEPS: u64 = 1_000_000_000;
-/// A longer file is no configuration: ours have 4 KB.
-const MOST_BYTES: u64 = 1 << 20;
-/// More batches in a step are one too.
-const MOST_BATCHES: u64 = 65_536;
+/// Largest configuration file, bytes. Ours: the files of this project have 4 KB.
+const MAX_BYTES: u64 = 1 << 20;
 
-/// Everything that decides a run.
+/// The configuration of a run, one field per table.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
     /// The network.
     pub model: ModelConfig,
-    /// The data set and how patches are cut.
+    /// The data set and its patches.
     pub data: DataConfig,
-    /// The optimisation.
+    /// The loss, a weighted sum.
+    pub loss: LossConfig,
+    /// The optimizer and its learning rate.
+    pub optimizer: OptimizerConfig,
+    /// Length, seed and start of the training.
     pub train: TrainConfig,
-    /// Where and how often the run is recorded.
+    /// The run directory and the intervals of records and checkpoints.
     pub run: RunConfig,
 }
 
@@ -49,13 +59,13 @@ pub enum ConfigError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The file is not TOML, holds unknown keys, or a value has the wrong type.
     #[error("{0}")]
     Source(String),
-    /// Values out of range, all of them.
+    /// All values out of range.
     #[error("{}: {}", path.display(), problems.join("; "))]
     Values {
         /// The file.
@@ -66,52 +76,82 @@ pub enum ConfigError {
 }
 
 impl Config {
-    /// Reads, edits and checks a configuration; the result has absolute paths.
+    /// Reads, edits and checks a configuration. The result has absolute paths and a run directory.
     ///
-    /// `sets` are the edits, `table.key=value`, the value in TOML's notation or a bare string.
+    /// `sets` are edits `table.key=value`, with the value in TOML notation or as a bare string. An
+    /// empty value removes the key.
     ///
     /// # Errors
-    /// See [`ConfigError`]; every unknown key and every value out of range is named.
+    /// See [`ConfigError`]. Every unknown key and every value out of range is named.
     pub fn load(path: &Path, sets: &[String]) -> Result<Self, ConfigError> {
-        let text = read_text(path).map_err(|source| ConfigError::Read {
+        let read_error = |source| ConfigError::Read {
             path: path.into(),
             source,
-        })?;
+        };
+        let text = read_text(path).map_err(read_error)?;
         let mut config = Self::parse(path, &text, sets)?;
-        if config.run.dir.as_os_str().is_empty() {
-            config.run.dir = Path::new("runs").join(path.file_stem().unwrap_or_default());
-        }
-        config.make_absolute().map_err(|source| ConfigError::Read {
-            path: path.into(),
-            source,
-        })?;
+        let default_dir = || Path::new("runs").join(path.file_stem().unwrap_or_default());
+        config.run.dir.get_or_insert_with(default_dir);
+        config.make_absolute().map_err(read_error)?;
         Ok(config)
     }
 
-    /// Edits and checks the text of a configuration, whose paths stay as they are; `path` is what errors call it.
+    /// Edits and checks the text of a configuration. Paths stay as they are; errors name `path`.
     ///
     /// # Errors
     /// As [`load`](Self::load).
     pub fn parse(path: &Path, text: &str, sets: &[String]) -> Result<Self, ConfigError> {
-        let config = source::parse(path, text, sets);
-        // A key may hold line breaks, and codes that a terminal obeys.
+        let config = source::parse::<Config>(path, text, sets, &Self::keys());
+        // Keys may contain line breaks and terminal control codes.
         let printable = |error: String| error.replace(char::is_control, "\u{fffd}");
-        let config = config.map_err(|error| ConfigError::Source(printable(error)))?;
+        let mut config = config.map_err(|error| ConfigError::Source(printable(error)))?;
         let problems = config.validate();
-        match problems.is_empty() {
-            true => Ok(config),
-            false => Err(ConfigError::Values {
+        if !problems.is_empty() {
+            return Err(ConfigError::Values {
                 path: path.into(),
                 problems,
-            }),
+            });
         }
+        config.optimizer.resolve();
+        Ok(config)
     }
 
-    fn make_absolute(&mut self) -> std::io::Result<()> {
+    /// Every key as `table.key`, optional ones included.
+    pub fn keys() -> BTreeSet<String> {
+        let tables = [
+            ("model", source::fields::<ModelConfig>()),
+            ("data", source::fields::<DataConfig>()),
+            ("loss", source::fields::<LossConfig>()),
+            ("optimizer", source::fields::<OptimizerConfig>()),
+            ("train", source::fields::<TrainConfig>()),
+            ("run", source::fields::<RunConfig>()),
+        ];
+        let keys = tables
+            .iter()
+            .flat_map(|(table, fields)| fields.iter().map(move |key| format!("{table}.{key}")));
+        keys.collect()
+    }
+
+    /// Every key that has a value, as `table.key`; optional keys are absent without one.
+    pub fn values(&self) -> BTreeMap<String, Value> {
+        let tables = toml::Table::try_from(self).expect("a configuration is plain data");
+        let mut values = BTreeMap::new();
+        for (table, keys) in tables {
+            if let Value::Table(keys) = keys {
+                let named = keys.into_iter();
+                values.extend(named.map(|(key, value)| (format!("{table}.{key}"), value)));
+            }
+        }
+        values
+    }
+
+    fn make_absolute(&mut self) -> io::Result<()> {
         self.data.root = std::path::absolute(&self.data.root)?;
-        self.run.dir = std::path::absolute(&self.run.dir)?;
-        if !self.train.init.as_os_str().is_empty() {
-            self.train.init = std::path::absolute(&self.train.init)?;
+        for path in [&mut self.run.dir, &mut self.train.init]
+            .into_iter()
+            .flatten()
+        {
+            *path = std::path::absolute(&*path)?;
         }
         if self.data.layout.ends_with(".toml") {
             let layout = std::path::absolute(&self.data.layout)?;
@@ -122,91 +162,19 @@ impl Config {
 
     /// Every value out of range, one line each.
     pub fn validate(&self) -> Vec<String> {
-        let (train, run) = (&self.train, &self.run);
         let mut problems = self.model.validate();
         problems.extend(self.data.validate());
-        let mut require = |holds: bool, key: &str, value: &dyn std::fmt::Debug, allowed: &str| {
-            if !holds {
-                problems.push(format!("{key} = {value:?}: must be {allowed}"));
-            }
-        };
-        for (key, value) in [
-            ("train.lr_start", train.lr_start),
-            ("train.lr_end", train.lr_end),
-            ("train.adam_epsilon", train.adam_epsilon.into()),
-            ("train.loss_epsilon", train.loss_epsilon.into()),
-        ] {
-            let positive = value.is_finite() && value > 0.0;
-            require(positive, key, &value, "a positive number");
+        problems.extend(self.loss.validate());
+        problems.extend(self.optimizer.validate());
+        problems.extend(self.train.validate());
+        problems.extend(self.run.validate());
+        let epsilon = self.data.albedo_demodulation_epsilon;
+        if let Some(epsilon) = epsilon.filter(|_| self.model.variant == Variant::ColorOnly) {
+            problems.push(format!(
+                "data.albedo_demodulation_epsilon = {epsilon:?}: must be absent for color-only, the control \
+                 without features; --set data.albedo_demodulation_epsilon= removes it"
+            ));
         }
-        for (key, value) in [
-            ("train.grad_clip", train.grad_clip),
-            ("train.ssim", train.ssim),
-            ("train.smape", train.smape),
-        ] {
-            let holds = value.is_finite() && value >= 0.0;
-            require(holds, key, &value, "0 (off) or a positive number");
-        }
-        require(
-            (0.0..1.0).contains(&train.ema),
-            "train.ema",
-            &train.ema,
-            "from 0 (off) to below 1",
-        );
-        for (key, value, most) in [
-            ("train.steps", train.steps, MOST_STEPS),
-            (
-                "train.grad_accumulation",
-                train.grad_accumulation as u64,
-                MOST_BATCHES,
-            ),
-            ("run.log_every", run.log_every, MOST_STEPS),
-            ("run.validate_every", run.validate_every, MOST_STEPS),
-            ("run.checkpoint_every", run.checkpoint_every, MOST_STEPS),
-            ("run.keep", run.keep as u64, MOST_STEPS),
-        ] {
-            let allowed = format!("from 1 to {most}");
-            require((1..=most).contains(&value), key, &value, &allowed);
-        }
-        let minutes = run.checkpoint_minutes;
-        require(
-            minutes.is_finite() && minutes >= 0.0,
-            "run.checkpoint_minutes",
-            &minutes,
-            "0 (off) or a positive number",
-        );
-        require(
-            train.warmup <= MOST_STEPS,
-            "train.warmup",
-            &train.warmup,
-            "at most 1000000000",
-        );
-        require(
-            train.recycle <= MOST_STEPS,
-            "train.recycle",
-            &train.recycle,
-            "at most 1000000000",
-        );
-        require(
-            run.keep_every <= MOST_STEPS,
-            "run.keep_every",
-            &run.keep_every,
-            "at most 1000000000",
-        );
-        let sees_texture = self.model.variant != Variant::ColorOnly || self.data.demodulate == 0.0;
-        require(
-            sees_texture,
-            "data.demodulate",
-            &self.data.demodulate,
-            "0 for color-only, the control without features",
-        );
-        let seed = train.seed <= i64::MAX as u64;
-        require(
-            seed,
-            "train.seed",
-            &train.seed,
-            "at most 9223372036854775807, TOML's largest integer",
-        );
         problems
     }
 
@@ -215,37 +183,46 @@ impl Config {
         toml::to_string(self).expect("a configuration is plain data")
     }
 
-    /// The learning rate of this run.
+    /// The run directory.
+    ///
+    /// # Panics
+    /// Without `run.dir`, which [`load`](Self::load) always sets.
+    pub fn run_dir(&self) -> &Path {
+        let dir = self.run.dir.as_deref();
+        dir.expect("a loaded configuration has a run directory")
+    }
+
+    /// The learning rate of each step of this run.
     pub fn learning_rate(&self) -> LearningRate {
-        let TrainConfig {
-            steps,
+        let OptimizerConfig {
             lr_start,
             lr_end,
-            decay,
-            warmup,
+            lr_decay,
+            warmup_steps,
             ..
-        } = self.train;
+        } = self.optimizer;
         LearningRate {
             start: lr_start,
             end: lr_end,
-            decay,
-            steps,
-            warmup,
+            decay: lr_decay,
+            steps: self.train.steps,
+            warmup_steps,
         }
     }
 
-    /// Patches that one step sees.
+    /// Patches per step.
     pub fn patches_per_step(&self) -> u64 {
         (self.data.batch_size * self.train.grad_accumulation) as u64
     }
 
-    /// The keys by which a run of `self` would differ from one of `other`; empty if one may continue the other.
+    /// The keys in which a run of `self` differs from one of `other`; empty if one may resume the
+    /// other.
     ///
-    /// Where the run and its data are kept (scenes, statistics and layout are compared on their own), when checkpoints are
-    /// written and which stay, what happens at a step that is not finite, and threads and memory of the loader change no
-    /// number of the run so far.
+    /// Keys that change no number of the run are ignored: run directory, checkpoint intervals,
+    /// `on_nan`, threads and memory of the loader. Data root and layout are ignored too, because a
+    /// resume compares scenes, statistics and channels themselves.
     pub fn differences(&self, other: &Config) -> Vec<String> {
-        let essence = |config: &Config| {
+        let relevant = |config: &Config| {
             let mut config = config.clone();
             let (log_every, validate_every) = (config.run.log_every, config.run.validate_every);
             config.run = RunConfig {
@@ -258,29 +235,29 @@ impl Config {
             config.data.layout = String::new();
             config.data.workers = DataConfig::default().workers;
             config.data.cache_mib = DataConfig::default().cache_mib;
-            source::leaves(&config)
+            config.values()
         };
-        let (ours, theirs) = (essence(self), essence(other));
-        let changed = ours
-            .iter()
-            .filter(|(key, value)| theirs.get(*key) != Some(*value));
-        changed
-            .map(|(key, value)| {
-                let there = theirs.get(key).map_or("nothing".into(), source::shown);
-                format!("{key} = {}, there {there}", source::shown(value))
+        let (ours, theirs) = (relevant(self), relevant(other));
+        let keys: BTreeSet<&String> = ours.keys().chain(theirs.keys()).collect();
+        let shown = |value: Option<&Value>| value.map_or("absent".into(), source::shown);
+        keys.into_iter()
+            .map(|key| (key, ours.get(key), theirs.get(key)))
+            .filter(|(_, ours, theirs)| ours != theirs)
+            .map(|(key, ours, theirs)| {
+                format!("{key}: {} instead of {}", shown(ours), shown(theirs))
             })
             .collect()
     }
 }
 
-/// The text of a file that may be a pipe, but not one without end.
+/// The text of a file, up to a limit: the file may be an endless pipe.
 fn read_text(path: &Path) -> io::Result<String> {
     let mut text = String::new();
     File::open(path)?
-        .take(MOST_BYTES + 1)
+        .take(MAX_BYTES + 1)
         .read_to_string(&mut text)?;
-    if text.len() as u64 > MOST_BYTES {
-        let why = format!("more than {MOST_BYTES} bytes; expected a configuration in TOML");
+    if text.len() as u64 > MAX_BYTES {
+        let why = format!("more than {MAX_BYTES} bytes; expected a configuration in TOML");
         return Err(io::Error::new(io::ErrorKind::InvalidData, why));
     }
     Ok(text)

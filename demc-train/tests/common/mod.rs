@@ -1,5 +1,6 @@
-//! What the tests of the program share: the real binary on the committed sample, with a network of a few seconds.
-#![allow(dead_code, reason = "each test file uses its part")]
+//! Shared by the tests of the program: the real binary on the committed sample, with a tiny
+//! network.
+#![allow(dead_code, reason = "each test file uses a part")]
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -9,13 +10,16 @@ pub fn sample() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../data/sample")
 }
 
-/// A run of twelve steps with everything in it that a resume could lose: batch normalisation, every augmentation, an
-/// average of the weights, two batches a step, a log that is not in step with the checkpoints.
+/// A run of twelve steps with everything that a resume could lose: batch normalisation, all
+/// augmentations, a weight average, Muon, two batches per step. Logs and checkpoints are at
+/// different steps.
 pub fn config(dir: &Path) -> PathBuf {
     let text = format!(
         "[model]\nwidth = 2\nreading = \"released\"\n\
-         [data]\nroot = {:?}\npatch_size = 64\nbatch_size = 2\nvalidation = 0.2\naugment = true\n\
-         [train]\nsteps = 12\nema = 0.9\nrecycle = 5\nlr_fan_in = 32\nmuon = 4\nlr_start = 1e-3\ngrad_accumulation = 2\ngrad_clip = 1.0\n\
+         [data]\nroot = {:?}\npatch_size = 64\nbatch_size = 2\nvalidation = 0.2\n\
+         augment = [\"flip\", \"transpose\", \"rgb\", \"exposure\", \"axes\", \"crop\", \"noise\"]\n\
+         [optimizer]\nkind = \"muon\"\nmuon_max_rows = 4\nlr_start = 1e-3\nmax_grad_norm = 1.0\n\
+         [train]\nsteps = 12\nema_decay = 0.9\ngrad_accumulation = 2\n\
          [run]\nlog_every = 2\nvalidate_every = 4\ncheckpoint_every = 3\nkeep = 2\n",
         sample()
     );
@@ -36,7 +40,7 @@ pub fn command(config: &Path, run: &Path, args: &[&str]) -> Command {
     command
 }
 
-/// Runs it to the end.
+/// Runs `demc-train` to its end.
 pub fn train(config: &Path, run: &Path, args: &[&str]) -> Output {
     command(config, run, args)
         .output()
@@ -48,7 +52,7 @@ pub fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// The one line that a failure prints, its exit code checked.
+/// Checks the exit code of a failure; returns its only line.
 pub fn error_line(output: &Output, code: i32) -> String {
     let text = stderr(output);
     assert_eq!(output.status.code(), Some(code), "{text}");
@@ -57,7 +61,7 @@ pub fn error_line(output: &Output, code: i32) -> String {
     text
 }
 
-/// `metrics.jsonl` without what depends on the clock.
+/// `metrics.jsonl` without the values that depend on the clock.
 pub fn metrics(run: &Path) -> Vec<serde_json::Value> {
     let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
     let lines = text
@@ -74,7 +78,7 @@ pub fn metrics(run: &Path) -> Vec<serde_json::Value> {
         .collect()
 }
 
-/// The files of a finished run of [`config`] that must not depend on what happened to it on the way.
+/// The files of a finished run of [`config`] that must not depend on interruptions.
 pub const RESULTS: [&str; 5] = [
     "best.safetensors",
     "checkpoints/step-00000012/model.safetensors",
@@ -83,7 +87,7 @@ pub const RESULTS: [&str; 5] = [
     "test.json",
 ];
 
-/// Fails unless two finished runs of [`config`] ended alike, log included.
+/// Fails unless two finished runs of [`config`] have equal results and logs.
 pub fn assert_same_run(whole: &Path, other: &Path, what: &str) {
     assert_eq!(metrics(other), metrics(whole), "{what}");
     for file in RESULTS {
@@ -92,7 +96,7 @@ pub fn assert_same_run(whole: &Path, other: &Path, what: &str) {
     }
 }
 
-/// Waits until `done`, for two minutes at most.
+/// Waits until `done`, at most two minutes.
 pub fn wait_until(mut done: impl FnMut() -> bool) {
     let started = std::time::Instant::now();
     while !done() {

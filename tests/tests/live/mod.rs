@@ -1,4 +1,4 @@
-//! What the tests share that need a Python: the interpreter, and networks with random weights.
+//! Shared by the tests that need Python: the interpreter, and networks with random weights.
 #![allow(dead_code, reason = "each test uses its part")]
 
 use std::ffi::OsStr;
@@ -25,8 +25,8 @@ const WIDTH: usize = 4;
 pub struct Python(String);
 
 impl Python {
-    /// The one named by `DEMC_PYTHON`, else `python3`, if it can import these `packages`. Else says that the test is skipped, or
-    /// fails it where the variable `required` is 1.
+    /// The interpreter named by `DEMC_PYTHON`, else `python3`, if it can import `packages`.
+    /// Otherwise reports that the test is skipped, or fails it if the variable `required` is 1.
     pub fn with(packages: &str, install: &str, required: &str) -> Option<Self> {
         let python = Python(std::env::var("DEMC_PYTHON").unwrap_or_else(|_| "python3".into()));
         let Err(reason) = python.check(packages, install) else {
@@ -36,12 +36,12 @@ impl Python {
             std::env::var(required).as_deref() != Ok("1"),
             "{required}=1, but {reason}"
         );
-        // Not `println!`, which the test harness swallows.
+        // Not `println!`, because the test harness captures it.
         writeln!(std::io::stderr(), "skipped: {reason}").expect("stderr can be written");
         None
     }
 
-    /// Whether it has what a test needs; else why not.
+    /// Checks for the packages; the error states the reason.
     fn check(&self, packages: &str, install: &str) -> Result<(), String> {
         let Python(program) = self;
         let output = self
@@ -57,12 +57,12 @@ impl Python {
         }
     }
 
-    /// The program.
+    /// Path of the interpreter.
     pub fn path(&self) -> &Path {
         Path::new(&self.0)
     }
 
-    /// Runs it, to success.
+    /// Runs it and asserts success.
     pub fn succeed(&self, arguments: &[&Path]) {
         let Output { status, stderr, .. } = self.run(arguments).expect("it ran before");
         let stderr = String::from_utf8_lossy(&stderr);
@@ -74,7 +74,7 @@ impl Python {
         &self,
         arguments: impl IntoIterator<Item = A>,
     ) -> std::io::Result<Output> {
-        // From a directory without a package `demc`, so that the installed one is found.
+        // In a directory without a package `demc`, so that Python finds the installed one.
         Command::new(&self.0)
             .args(arguments)
             .current_dir(env!("CARGO_MANIFEST_DIR"))
@@ -82,8 +82,9 @@ impl Python {
     }
 }
 
-/// A network with its initial weights moved at random by `move_by`, so that no bias is zero and no running statistic trivial. Up
-/// rather than down, so that ReLUs stay open: the further, the larger the outputs and their range.
+/// A network whose initial weights are changed at random by `move_by`, so that no bias is zero and
+/// no running statistic is trivial. Mostly positive changes keep ReLUs open; larger changes give
+/// larger outputs.
 pub fn random_bundle(
     variant: Variant,
     reading: Reading,
@@ -94,7 +95,7 @@ pub fn random_bundle(
         variant,
         reading,
         width: WIDTH,
-        // The paper's or others.
+        // The paper's levels or others.
         levels: match rng.random() {
             true => LEVEL_WIDTHS,
             false => [2, 1, 3, 2, 4],
@@ -109,10 +110,10 @@ pub fn random_bundle(
     }
     let normalizer = Normalizer {
         gamma: 2.2,
-        // One reading with, one without.
-        demodulate: match reading {
-            Reading::Paper => 0.0,
-            Reading::Released => 1.0,
+        // One reading with demodulation, one without.
+        albedo_demodulation_epsilon: match reading {
+            Reading::Paper => None,
+            Reading::Released => Some(1.0),
         },
         features: FeatureStats {
             mean: std::array::from_fn(|channel| 0.3 * channel as f32 - 1.0),
@@ -134,13 +135,13 @@ pub fn uniform(low: f32, high: f32, count: usize, rng: &mut ChaCha8Rng) -> Vec<f
     (0..count).map(|_| rng.random_range(low..high)).collect()
 }
 
-/// Writes raw float32.
+/// Writes raw float32 values.
 pub fn write_floats<'a>(path: &Path, values: impl IntoIterator<Item = &'a f32>) {
     let bytes: Vec<u8> = values.into_iter().flat_map(|v| v.to_le_bytes()).collect();
     fs::write(path, bytes).expect("a writable temporary directory");
 }
 
-/// Reads them.
+/// Reads raw float32 values.
 pub fn read_floats(path: &Path) -> Vec<f32> {
     let bytes = fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
     let words = bytes.as_chunks().0.iter();

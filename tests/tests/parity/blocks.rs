@@ -1,4 +1,5 @@
-//! Blocks on their own: the parts of a DEMC with the weights of the fixture `demc-READING`, on inputs of their own.
+//! Parity of single blocks: the parts of a DEMC with the weights of the fixture `demc-READING`,
+//! each with its own inputs.
 //!
 //! The loss is `sum(outputs * probes)` with random probes, so that no gradient is trivial.
 
@@ -6,8 +7,7 @@ use std::collections::BTreeMap;
 
 use burn::optim::GradientsParams;
 use burn::tensor::Tensor;
-use demc_model::Loss;
-use demc_model::metrics::LOSS_EPSILON;
+use demc_model::LossConfig;
 use demc_model::ops::{self, Activation, Maps};
 use demc_model::{Denoiser, Reading, Variant};
 
@@ -17,12 +17,12 @@ use crate::fixture::{
 use crate::tensors::{Tolerance, assert_close};
 use crate::{GRADIENT, OUTPUT};
 
-/// What runs one block of a network: its inputs to its outputs.
-type Forward = fn(&Denoiser, Vec<Maps>) -> Vec<Maps>;
+/// A function that runs one block of a network.
+type BlockForward = fn(&Denoiser, Vec<Maps>) -> Vec<Maps>;
 
 #[test]
 fn fusion_is_pytorchs() {
-    let forward: Forward = |model, inputs| {
+    let forward: BlockForward = |model, inputs| {
         let fusion = model.fusion.as_ref().expect("a DEMC has a fusion");
         inputs.into_iter().map(|x| fusion.forward(x)).collect()
     };
@@ -45,7 +45,7 @@ fn last_level_of_the_feature_encoder_is_pytorchs() {
 
 #[test]
 fn latent_is_pytorchs() {
-    let forward: Forward = |model, inputs| {
+    let forward: BlockForward = |model, inputs| {
         inputs
             .into_iter()
             .map(|x| model.latent.forward(x))
@@ -56,7 +56,7 @@ fn latent_is_pytorchs() {
 
 #[test]
 fn decoder_level_is_pytorchs() {
-    let forward: Forward = |model, mut inputs| {
+    let forward: BlockForward = |model, mut inputs| {
         let skips = inputs.split_off(1);
         inputs
             .into_iter()
@@ -68,8 +68,8 @@ fn decoder_level_is_pytorchs() {
 
 #[test]
 fn head_is_pytorchs() {
-    // Without its ReLU, which belongs to the decoder.
-    let forward: Forward = |model, inputs| {
+    // The ReLU belongs to the decoder.
+    let forward: BlockForward = |model, inputs| {
         inputs
             .into_iter()
             .map(|x| x.conv3x3(&model.decoder.head, Activation::None))
@@ -85,7 +85,7 @@ fn loss_and_its_gradient_are_pytorchs_at_black_pixels_too() {
     let output = fixture.tensor("loss/output_gamma", &device).require_grad();
     let reference = fixture.tensor("loss/reference_hdr", &device);
     let ops = ops::process_default();
-    let losses = Loss::RelMse.per_image(ops, output.clone(), reference, 2.2, LOSS_EPSILON);
+    let losses = LossConfig::default().per_image(ops, output.clone(), reference, 2.2);
     let loss = losses.mean();
     assert_close(
         "loss",
@@ -112,14 +112,14 @@ fn encode(model: &Denoiser, [encoder, level]: [usize; 2], inputs: Vec<Maps>) -> 
         .collect()
 }
 
-/// `forward` between tensors of Burn, on the operations of the network.
-fn run(model: &Denoiser, forward: Forward, inputs: Vec<Tensor<4>>) -> Vec<Tensor<4>> {
+/// Runs `forward` on Burn tensors, with the operations of the network.
+fn run(model: &Denoiser, forward: BlockForward, inputs: Vec<Tensor<4>>) -> Vec<Tensor<4>> {
     let inputs = inputs.into_iter().map(|x| Maps::from_nchw(x, model.ops()));
     let outputs = forward(model, inputs.collect());
     outputs.into_iter().map(Maps::into_nchw).collect()
 }
 
-fn in_both_readings(path: &str, forward: Forward) {
+fn in_both_readings(path: &str, forward: BlockForward) {
     let fixture = Fixture::read("blocks");
     for reading in Reading::ALL {
         let share = check(&fixture, reading, path, forward);
@@ -130,7 +130,7 @@ fn in_both_readings(path: &str, forward: Forward) {
     }
 }
 
-fn check(fixture: &Fixture, reading: Reading, path: &str, forward: Forward) -> String {
+fn check(fixture: &Fixture, reading: Reading, path: &str, forward: BlockForward) -> String {
     let weights = Fixture::read(&network_name(Variant::Demc, reading));
     let prefix = format!("{}/{path}", reading.spec().name);
     let outputs_close = |mode: &str, outputs: &[Tensor<4>]| {

@@ -6,21 +6,20 @@ use std::path::PathBuf;
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
-use demc_infer::Names;
 use demc_model::{Denoiser, ModelConfig, Reading, Variant, Weight, Weights};
 
-use crate::tensors::{self, Values};
+use crate::tensors::{self, HostTensor};
 
 /// The width of the fixtures' networks.
 const WIDTH: usize = 2;
 
 /// One fixture file. Its tensors have PyTorch's names, after a prefix.
-pub struct Fixture(BTreeMap<String, Values>);
+pub struct Fixture(BTreeMap<String, HostTensor>);
 
 impl Fixture {
     /// The file `name`.safetensors.
     pub fn read(name: &str) -> Self {
-        // A test that was carried to another machine is told where they are.
+        // A test copied to another machine finds them by this variable.
         let folder = std::env::var_os("DEMC_FIXTURES").map_or_else(
             || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("parity/fixtures"),
             PathBuf::from,
@@ -52,10 +51,12 @@ impl Fixture {
             .collect()
     }
 
-    /// All tensors whose names begin with `prefix`, under Burn's names without it.
+    /// All tensors whose names begin with `prefix`, with Burn's names and without the prefix.
     pub fn group(&self, prefix: &str) -> Vec<Weight> {
-        let weight = |(name, values): (&String, &Values)| {
-            let name = Names::Torch.to_burn(name);
+        let weight = |(name, values): (&String, &HostTensor)| {
+            let name = name
+                .replace(".norm.weight", ".norm.gamma")
+                .replace(".norm.bias", ".norm.beta");
             let (shape, data) = (values.shape.clone(), values.data.clone());
             Some(Weight {
                 name: name.strip_prefix(prefix)?.to_string(),
@@ -67,7 +68,7 @@ impl Fixture {
     }
 }
 
-/// The name of a fixture file.
+/// Name of a fixture file.
 pub fn network_name(variant: Variant, reading: Reading) -> String {
     format!("{}-{}", variant.spec().name, reading.spec().name)
 }
@@ -99,13 +100,13 @@ pub fn gradients_by_name(
     module: &impl Module,
     gradients: &GradientsParams,
 ) -> BTreeMap<String, Vec<f32>> {
-    struct Collector<'a> {
+    struct GradientCollector<'a> {
         path: Vec<String>,
         gradients: &'a GradientsParams,
         found: BTreeMap<String, Vec<f32>>,
     }
 
-    impl ModuleVisitor for Collector<'_> {
+    impl ModuleVisitor for GradientCollector<'_> {
         fn enter_module(&mut self, name: &str, _container_type: &str) {
             self.path.push(name.to_string());
         }
@@ -121,7 +122,7 @@ pub fn gradients_by_name(
         }
     }
 
-    let mut collector = Collector {
+    let mut collector = GradientCollector {
         path: Vec::new(),
         gradients,
         found: BTreeMap::new(),
@@ -130,8 +131,8 @@ pub fn gradients_by_name(
     collector.found
 }
 
-/// Whether a weight is a bias before a batch normalisation, which takes it away again with the mean: its gradient is
-/// zero by construction, what float32 leaves of it is noise.
+/// Whether a weight is a bias before a batch normalisation. Subtracting the mean cancels the bias,
+/// so its gradient is zero except for float32 noise.
 pub fn is_bias_before_norm(name: &str, reading: Reading) -> bool {
     let fused = ["fusion.blocks.1.conv.bias", "fusion.blocks.2.conv.bias"].contains(&name);
     let decoded = name == "latent.conv.bias" || name.ends_with("deconv.bias");

@@ -1,9 +1,11 @@
-//! Parity with PyTorch on committed fixtures: each block, each variant in each reading, the loss, every gradient, five
-//! steps of Adam. No Python is needed here; `tests/parity/make_fixtures.py` makes the fixtures, in float64, so the
-//! deviations are those of this side. `parity_live.rs` compares with a PyTorch that is there.
+//! Parity with PyTorch on committed fixtures: each block, each variant in each reading, the loss,
+//! every gradient, and five steps of Adam. `docs/network.md` describes the network.
 //!
-//! `DEMC_DEVICE` names the device (default `flex`) and `DEMC_OPS` the operations (default `kernels`), so the same numbers are
-//! asked of every backend that was built.
+//! These tests need no Python. `tests/parity/make_fixtures.py` computes the fixtures in float64, so
+//! deviations come from this implementation. `parity_live.rs` compares with an installed PyTorch.
+//!
+//! `DEMC_DEVICE` names the device (default `flex`) and `DEMC_OPS` the operations (default
+//! `kernels`), so the fixtures test every backend of the build.
 
 mod blocks;
 mod fixture;
@@ -23,14 +25,15 @@ pub fn device() -> Device {
     demc_infer::device::parse(&name).unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// Outputs: a float32 PyTorch is off by up to 1e-6 of the largest value, after 27 layers.
+/// For outputs: after 27 layers, float32 PyTorch deviates by up to 1e-6 of the largest value.
 pub const OUTPUT: Tolerance = Tolerance {
     absolute: 0.0,
     of_largest: 1e-5,
     of_value: 0.0,
 };
 
-/// Gradients: sums over up to 8192 pixels and 27 layers, off by up to 0.15 of this in a float32 PyTorch.
+/// For gradients: sums over up to 8192 pixels and 27 layers. float32 PyTorch deviates by up to 0.15
+/// of this.
 pub const GRADIENT: Tolerance = Tolerance {
     absolute: 0.0,
     of_largest: 2e-5,

@@ -4,8 +4,7 @@ use std::collections::BTreeMap;
 
 use burn::optim::{AdamConfig, GradientsParams};
 use burn::tensor::{Device, Tensor};
-use demc_model::Loss;
-use demc_model::metrics::LOSS_EPSILON;
+use demc_model::LossConfig;
 use demc_model::{Denoiser, Ops, Reading, Variant, ops};
 
 use crate::fixture::{
@@ -17,30 +16,34 @@ use crate::{GRADIENT, OUTPUT};
 const STEPS: usize = 5;
 const LEARNING_RATE: f64 = 1e-3;
 
-/// A weight whose gradient keeps its sign moves by a learning rate a step; 2 % of that. Adam divides by the
-/// gradient's own size, so the smallest gradients bring their rounding error along in full.
+/// 2 % of the path of a weight whose gradient keeps its sign, one learning rate per step. Adam
+/// divides by the size of the gradient, so rounding errors of the smallest gradients keep their
+/// relative size.
 const ADAM: Tolerance = Tolerance {
     absolute: 1e-4,
     of_largest: 0.0,
     of_value: 0.0,
 };
 
-/// Where the gradient is exactly 0, as it is for some weights on the deepest maps of 2x2 pixels, the kernels' weight gradient
-/// (Winograd's, a sum that cancels) leaves 1e-9, of which Adam's epsilon of 1e-8 makes a step: measured 6e-4, and 1e-3 where
-/// that turned a pixel on or off. So this is loose, and Burn's operations take the same steps within [`ADAM`].
+/// Looser than [`ADAM`], which Burn's operations meet. Some weights on the deepest maps of 2x2
+/// pixels have a gradient of exactly 0. There the cancelling sums of Winograd's weight gradient
+/// leave 1e-9. With an epsilon of 1e-8, Adam turns that into a step: measured 6e-4, or 1e-3 if it
+/// switches a pixel on or off.
 const ADAM_ON_KERNELS: Tolerance = Tolerance {
     absolute: 3e-3,
     ..ADAM
 };
 
-/// A bias before a batch normalisation has no gradient but noise, which Adam blows up to a step of up to one learning rate.
+/// The gradient of a bias before a batch normalisation is noise. Adam scales it to a step of up to
+/// one learning rate.
 const WANDERING_BIAS: Tolerance = Tolerance {
     absolute: 5e-3,
     of_largest: 0.0,
     of_value: 0.0,
 };
 
-/// The running mean contains that bias: 0.01 of 0 + 1 + 2 + 3 + 4 learning rates, and what other weights may do.
+/// The running mean contains that bias: 0.01 of 0 + 1 + 2 + 3 + 4 learning rates, plus the
+/// tolerance of other weights.
 const RUNNING_MEAN: Tolerance = Tolerance {
     absolute: 1e-4 + 1e-4,
     of_largest: 0.0,
@@ -48,16 +51,16 @@ const RUNNING_MEAN: Tolerance = Tolerance {
 };
 
 /// The inputs and the reference, on one device.
-struct Batch {
+struct FixtureBatch {
     color_gamma: Tensor<4>,
     features_z: Tensor<4>,
     reference_hdr: Tensor<4>,
 }
 
-impl Batch {
+impl FixtureBatch {
     fn read(device: &Device) -> Self {
         let inputs = Fixture::read("inputs");
-        Batch {
+        FixtureBatch {
             color_gamma: inputs.tensor("color_gamma", device),
             features_z: inputs.tensor("features_z", device),
             reference_hdr: inputs.tensor("reference_hdr", device),
@@ -70,7 +73,7 @@ impl Batch {
 
     fn loss(&self, ops: Ops, output: Tensor<4>) -> Tensor<1> {
         let reference_hdr = self.reference_hdr.clone();
-        let losses = Loss::RelMse.per_image(ops, output, reference_hdr, 2.2, LOSS_EPSILON);
+        let losses = LossConfig::default().per_image(ops, output, reference_hdr, 2.2);
         losses.mean()
     }
 }
@@ -121,11 +124,11 @@ fn check(variant: Variant, reading: Reading) {
     let eval = check_eval(variant, reading, &fixture);
 
     let device = crate::device().autodiff();
-    let batch = Batch::read(&device);
+    let batch = FixtureBatch::read(&device);
     let model = network(variant, reading, &fixture, &device);
     let train = check_first_step(&model, &batch, reading, &fixture);
 
-    // Models of their own: the forward pass above has moved the running statistics of the first.
+    // New models, because the forward pass above changed the running statistics of the first one.
     let stepped = |ops| {
         let model = network(variant, reading, &fixture, &device).with_ops(ops);
         check_adam(model, &batch, reading, &fixture)
@@ -144,7 +147,7 @@ fn check(variant: Variant, reading: Reading) {
 fn check_eval(variant: Variant, reading: Reading, fixture: &Fixture) -> f32 {
     let device = crate::device();
     let model = network(variant, reading, fixture, &device);
-    let output = host(Batch::read(&device).output(&model));
+    let output = host(FixtureBatch::read(&device).output(&model));
     assert_close(
         "output in eval mode",
         &output,
@@ -155,7 +158,7 @@ fn check_eval(variant: Variant, reading: Reading, fixture: &Fixture) -> f32 {
 
 fn check_first_step(
     model: &Denoiser,
-    batch: &Batch,
+    batch: &FixtureBatch,
     reading: Reading,
     fixture: &Fixture,
 ) -> String {
@@ -182,7 +185,8 @@ fn check_first_step(
     let mut worst = 0.0f32;
     for (name, expected_values) in &expected {
         let tolerance = match is_bias_before_norm(name, reading) {
-            // Zero by construction: the same share, of the largest gradient of the convolution's weights.
+            // Zero by construction: the same share of the largest gradient of the convolution's
+            // weights.
             true => Tolerance {
                 absolute: GRADIENT.of_largest * largest(&expected[&name.replace("bias", "weight")]),
                 ..GRADIENT
@@ -199,8 +203,13 @@ fn check_first_step(
     format!("train {output_share:.3}, loss {loss_share:.3}, gradients {worst:.3}")
 }
 
-fn check_adam(mut model: Denoiser, batch: &Batch, reading: Reading, fixture: &Fixture) -> String {
-    // As `demc-train` has it (Sec. 4.2; Burn's epsilon would be 1e-5).
+fn check_adam(
+    mut model: Denoiser,
+    batch: &FixtureBatch,
+    reading: Reading,
+    fixture: &Fixture,
+) -> String {
+    // The settings of `demc-train` (Sec. 4.2; Burn's default epsilon is 1e-5).
     let mut adam = AdamConfig::new()
         .with_beta_1(0.9)
         .with_beta_2(0.999)

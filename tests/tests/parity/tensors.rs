@@ -1,4 +1,4 @@
-//! Tensors in safetensors files, and how close two of them are.
+//! Tensors in safetensors files, and their comparison.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,7 +8,7 @@ use safetensors::SafeTensors;
 
 /// A tensor on the host.
 #[derive(Clone, Debug)]
-pub struct Values {
+pub struct HostTensor {
     /// Axes, outermost first.
     pub shape: Vec<usize>,
     /// Row-major values.
@@ -16,7 +16,7 @@ pub struct Values {
 }
 
 /// All tensors of a safetensors file of f32.
-pub fn read(path: &Path) -> BTreeMap<String, Values> {
+pub fn read(path: &Path) -> BTreeMap<String, HostTensor> {
     let bytes = fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
     let file = SafeTensors::deserialize(&bytes).expect("a whole safetensors file");
     let values = |bytes: &[u8]| {
@@ -27,7 +27,7 @@ pub fn read(path: &Path) -> BTreeMap<String, Values> {
         let shape = view.shape().to_vec();
         (
             name.to_string(),
-            Values {
+            HostTensor {
                 shape,
                 data: values(view.data()),
             },
@@ -36,7 +36,7 @@ pub fn read(path: &Path) -> BTreeMap<String, Values> {
     tensors.collect()
 }
 
-/// How far a value may lie from the expected one: the sum of the three parts.
+/// Maximum difference from the expected value: the sum of the three parts.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Tolerance {
     /// In the unit of the values.
@@ -47,8 +47,8 @@ pub struct Tolerance {
     pub of_value: f32,
 }
 
-/// Fails, naming `what` and the worst element, where any element is outside the tolerance. Returns the largest share
-/// of the tolerance that an element takes.
+/// Asserts that all elements are within the tolerance; a failure names `what` and the worst
+/// element. Returns the largest share of the tolerance.
 pub fn assert_close(what: &str, found: &[f32], expected: &[f32], tolerance: Tolerance) -> f32 {
     assert_eq!(found.len(), expected.len(), "{what}: number of values");
     let largest = expected.iter().fold(0.0f32, |m, v| m.max(v.abs()));
@@ -57,7 +57,7 @@ pub fn assert_close(what: &str, found: &[f32], expected: &[f32], tolerance: Tole
             + tolerance.of_largest * largest
             + tolerance.of_value * expected.abs();
         let difference = (found - expected).abs();
-        // Equal zeros are fine under any tolerance, NaN under none.
+        // Equal zeros pass any tolerance, NaN passes none.
         if difference == 0.0 {
             0.0
         } else if difference.is_nan() {

@@ -1,25 +1,25 @@
-//! What pixels give to their neighbours, summed (*col2im*).
+//! Contributions of pixels to their neighbours, summed (*col2im*).
 
 use rayon::prelude::*;
 
 use super::gather::neighbour;
-use crate::conv3x3::parts::{Axes, Finish, Source};
+use crate::conv3x3::parts::{Axes, BiasRelu, GatedMap};
 use crate::product::padded_rows;
 use crate::rows::{self, BLOCK, Packed, Term, whole};
 use crate::scratch::Scratch;
 use crate::simd::{Leaf, Simd, run};
 use crate::{Grid, Isa};
 
-/// By the values that a pixel gives to its neighbours.
+/// Convolves by the values that each pixel contributes to its neighbours.
 #[allow(clippy::too_many_arguments, reason = "as `convolve`")]
 pub(super) fn collect(
     isa: Isa,
     grid: Grid,
-    source: Source,
+    source: GatedMap,
     above: usize,
     weight: &[f32],
     axes: Axes,
-    finish: Finish,
+    epilogue: BiasRelu,
     y: &mut [f32],
 ) {
     let (depth, outputs) = (axes.inputs, axes.outputs);
@@ -29,7 +29,7 @@ pub(super) fn collect(
     });
     let wide = whole(columns);
     let image = grid.height * grid.width;
-    // An image at a time, so that what is collected is still in a cache.
+    // One image at a time, so that the contributions stay in a cache.
     let mut given = Scratch::take((image.next_multiple_of(BLOCK) + BLOCK) * wide);
     let rows = y.len() / grid.batch;
     for (index, y) in y.chunks_mut(rows).enumerate() {
@@ -66,7 +66,7 @@ pub(super) fn collect(
                     grid,
                     given: &given,
                     wide,
-                    finish,
+                    epilogue,
                     row: above + row,
                     outputs,
                     y,
@@ -77,12 +77,12 @@ pub(super) fn collect(
     }
 }
 
-/// Sums what the neighbours of a row of pixels give to it.
+/// Sums the contributions that a row of pixels receives from its neighbours.
 struct Collect<'a> {
     grid: Grid,
     given: &'a [f32],
     wide: usize,
-    finish: Finish<'a>,
+    epilogue: BiasRelu<'a>,
     row: usize,
     outputs: usize,
     y: &'a mut [f32],
@@ -97,7 +97,7 @@ impl Leaf for Collect<'_> {
             grid,
             given,
             wide,
-            finish,
+            epilogue,
             row,
             outputs,
             y,
@@ -110,7 +110,7 @@ impl Leaf for Collect<'_> {
                 let n = S::LANES.min(outputs - channel);
                 // SAFETY: neighbours are pixels of the image, each with `9 * outputs` values.
                 unsafe {
-                    let mut sum = finish.bias::<S>(channel, n);
+                    let mut sum = epilogue.bias::<S>(channel, n);
                     for tap in 0..9 {
                         if let Some(offset) = neighbour(grid, row, column, tap) {
                             let from =
@@ -118,7 +118,7 @@ impl Leaf for Collect<'_> {
                             sum = S::add(sum, S::load_part(given.as_ptr().add(from), n));
                         }
                     }
-                    let value = if finish.relu { S::relu(sum) } else { sum };
+                    let value = if epilogue.relu { S::relu(sum) } else { sum };
                     S::store_part(y.as_mut_ptr().add(channel), n, value);
                 }
             }

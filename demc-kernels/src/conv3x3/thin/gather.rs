@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use crate::conv3x3::parts::Source;
+use crate::conv3x3::parts::GatedMap;
 use crate::rows::{Copy, copy};
 use crate::simd::{Leaf, Simd, run};
 use crate::{Grid, Isa};
@@ -11,8 +11,8 @@ use crate::{Grid, Isa};
 #[inline(always)]
 pub(super) fn neighbour(grid: Grid, row: usize, column: usize, tap: usize) -> Option<isize> {
     let (y, x) = (row + tap / 3, column + tap % 3);
-    let there = y >= 1 && y <= grid.height && x >= 1 && x <= grid.width;
-    there.then(|| {
+    let inside = y >= 1 && y <= grid.height && x >= 1 && x <= grid.width;
+    inside.then(|| {
         (tap / 3) as isize * grid.width as isize + (tap % 3) as isize - grid.width as isize - 1
     })
 }
@@ -25,10 +25,11 @@ fn place(grid: Grid, pixel: usize) -> (usize, usize) {
 
 /// The neighbourhoods of some pixels as rows of `9 * channels` values, `step` values apart.
 struct Gather<'a> {
-    source: Source<'a>,
+    source: GatedMap<'a>,
     grid: Grid,
     pixels: Range<usize>,
-    /// Whether a row holds the pixels that this one gives to, instead of those that it takes from.
+    /// If set, a row holds the pixels that this pixel contributes to, instead of those that it
+    /// reads.
     mirrored: bool,
     rows: &'a mut [f32],
     step: usize,
@@ -71,13 +72,13 @@ impl Leaf for Gather<'_> {
                 continue;
             }
             for tap in 0..9 {
-                let to = &mut row[tap * channels..(tap + 1) * channels];
+                let target = &mut row[tap * channels..(tap + 1) * channels];
                 match neighbour(grid, y, x, if mirrored { 8 - tap } else { tap }) {
-                    None => to.fill(0.0),
+                    None => target.fill(0.0),
                     Some(offset) => {
                         let first = pixel.wrapping_add_signed(offset) * channels;
                         // SAFETY: the neighbour lies in the image.
-                        unsafe { copy_part::<S>(source, first, to, channels) };
+                        unsafe { copy_part::<S>(source, first, target, channels) };
                     }
                 }
             }
@@ -90,22 +91,22 @@ impl Leaf for Gather<'_> {
 /// # Safety
 /// The machine has the path of `S`, and the map and its gate that many values there.
 #[inline(always)]
-unsafe fn copy_part<S: Simd>(source: Source, first: usize, to: &mut [f32], count: usize) {
-    assert!(to.len() >= count);
-    for at in (0..count).step_by(S::LANES) {
-        let n = S::LANES.min(count - at);
-        // SAFETY: `n` values from `at` on are there.
+unsafe fn copy_part<S: Simd>(source: GatedMap, first: usize, target: &mut [f32], count: usize) {
+    assert!(target.len() >= count);
+    for offset in (0..count).step_by(S::LANES) {
+        let n = S::LANES.min(count - offset);
+        // SAFETY: `n` values from `offset` on are there.
         unsafe {
-            let mut v = S::load_part(source.map.as_ptr().add(first + at), n);
+            let mut v = S::load_part(source.map.as_ptr().add(first + offset), n);
             if let Some(gate) = source.gate {
-                v = S::gate(v, S::load_part(gate.as_ptr().add(first + at), n));
+                v = S::gate(v, S::load_part(gate.as_ptr().add(first + offset), n));
             }
-            S::store_part(to.as_mut_ptr().add(at), n, v);
+            S::store_part(target.as_mut_ptr().add(offset), n, v);
         }
     }
 }
 
-impl Source<'_> {
+impl GatedMap<'_> {
     /// See [`Gather`].
     pub(super) fn gather(
         &self,
@@ -143,8 +144,8 @@ impl Source<'_> {
                 gate: self.gate.map(|gate| &gate[first..]),
                 bias: None,
                 relu: false,
-                to: rows,
-                to_step: step,
+                target: rows,
+                target_step: step,
                 rows: pixels.len(),
                 channels,
             },

@@ -1,30 +1,34 @@
-//! 3x3 convolutions with few channels on one side (the first and the last of the network), as plain sums.
+//! 3x3 convolutions with few channels on one side (the first and the last of the network), as plain
+//! sums.
 //!
-//! Few inputs: the 3x3 neighbourhood of a pixel becomes a row of `9 * in` values (*im2col*), and the convolution one
-//! product. Few outputs would leave most lanes of a vector empty; there the product makes all `9 * out` values that a
-//! pixel gives to its neighbours, which are then collected (*col2im*).
+//! Few inputs: the 3x3 neighbourhood of a pixel becomes a row of `9 * in` values (*im2col*), and
+//! the convolution is one product.
+//!
+//! Few outputs: such a product would leave most lanes of a vector empty. Instead, one product
+//! computes all `9 * out` values that a pixel contributes to its neighbours. These are then
+//! collected (*col2im*).
 
 mod collect;
 mod gather;
 
 use rayon::prelude::*;
 
-use super::parts::{Axes, Finish, Source};
+use super::parts::{Axes, BiasRelu, GatedMap};
 use crate::product::padded_rows;
 use crate::rows::{self, BLOCK, Copy, Outer, Packed, Term, copy, whole};
 use crate::scratch::Scratch;
 use crate::{Grid, Isa};
 use collect::collect;
 
-/// Most values that all taps of the outputs together may have for collecting to pay.
+/// Maximum number of output values over all taps for which collecting pays off.
 const MOST_COLLECTED: usize = 36;
 
-/// `y = finish(weight * x)`, `x` gated where a gate is given, of the rows from `above` on, as many as `y` has; `grid` is
-/// that of `x`.
+/// `y = epilogue(weight * x)` for the rows from `above` on, as many as `y` has. `x` is gated if a
+/// gate is given; `grid` is the grid of `x`.
 ///
 /// # Panics
-/// Where there are several images and `y` does not have all their rows.
-#[allow(clippy::too_many_arguments, reason = "what a convolution is made of")]
+/// If there are several images and `y` does not have all their rows.
+#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
 pub(crate) fn convolve(
     isa: Isa,
     grid: Grid,
@@ -33,10 +37,10 @@ pub(crate) fn convolve(
     above: usize,
     weight: &[f32],
     axes: Axes,
-    finish: Finish,
+    epilogue: BiasRelu,
     y: &mut [f32],
 ) {
-    let source = Source {
+    let source = GatedMap {
         map: x,
         gate,
         channels: axes.inputs,
@@ -52,22 +56,22 @@ pub(crate) fn convolve(
         "a band of a single image"
     );
     if 9 * axes.outputs <= MOST_COLLECTED && axes.inputs > axes.outputs {
-        collect(isa, grid, source, above, weight, axes, finish, y);
+        collect(isa, grid, source, above, weight, axes, epilogue, y);
     } else {
-        spread(isa, grid, source, above, weight, axes, finish, y);
+        spread(isa, grid, source, above, weight, axes, epilogue, y);
     }
 }
 
-/// By rows of neighbourhoods.
+/// Convolves by rows of neighbourhoods.
 #[allow(clippy::too_many_arguments, reason = "as `convolve`")]
 fn spread(
     isa: Isa,
     grid: Grid,
-    source: Source,
+    source: GatedMap,
     above: usize,
     weight: &[f32],
     axes: Axes,
-    finish: Finish,
+    epilogue: BiasRelu,
     y: &mut [f32],
 ) {
     let (depth, columns) = (9 * axes.inputs, axes.outputs);
@@ -107,10 +111,10 @@ fn spread(
                     from: &c,
                     from_step: wide,
                     gate: None,
-                    bias: finish.bias,
-                    relu: finish.relu,
-                    to: y,
-                    to_step: columns,
+                    bias: epilogue.bias,
+                    relu: epilogue.relu,
+                    target: y,
+                    target_step: columns,
                     rows: count,
                     channels: columns,
                 },
@@ -118,10 +122,12 @@ fn spread(
         });
 }
 
-/// Stretches that the pixels are cut into for a gradient: each is summed by one task, and the sums are added in order.
+/// Number of stretches of pixels for a gradient. One task sums each stretch; the sums are added in
+/// order.
 const STRETCHES: usize = 16;
 
-/// Gradient by the weight `[out, in, 3, 3]` and by the bias, `dy` gated where a gate is given.
+/// Gradients with respect to the weight `[out, in, 3, 3]` and the bias. `dy` is gated if a gate is
+/// given.
 pub(crate) fn gradient(
     isa: Isa,
     grid: Grid,
@@ -132,24 +138,24 @@ pub(crate) fn gradient(
     dbias: &mut [f32],
 ) {
     let (inputs, outputs) = (grid.channels(x.len()), dbias.len());
-    let x = Source {
+    let x = GatedMap {
         map: x,
         gate: None,
         channels: inputs,
     };
-    let dy = Source {
+    let dy = GatedMap {
         map: dy,
         gate,
         channels: outputs,
     };
-    // The thin side is the one whose neighbourhoods become rows.
+    // The neighbourhoods of the thin side become rows.
     let by_output = 9 * outputs <= MOST_COLLECTED && inputs > outputs;
     let (rows, columns) = if by_output {
         (inputs, 9 * outputs)
     } else {
         (9 * inputs, outputs)
     };
-    // One row more, of ones: its gradient is the sum of `dy`, the bias's.
+    // An extra row of ones: its gradient is the sum of `dy`, which is the gradient of the bias.
     let (tall, wide) = (padded_rows(rows + 1), whole(columns));
     let pixels = grid.pixels();
     let stretch = pixels.div_ceil(STRETCHES).next_multiple_of(BLOCK);
@@ -202,7 +208,7 @@ pub(crate) fn gradient(
                 };
             }
         }
-        // Among the neighbourhoods of `dy` the middle tap is `dy` itself.
+        // The middle tap of the neighbourhoods of `dy` is `dy` itself.
         dbias[o] = total(rows, if by_output { 4 * outputs + o } else { o });
     }
 }

@@ -1,23 +1,24 @@
-//! The gradient by the weight: products whose reduction runs over tiles.
+//! The gradient with respect to the weight: products with a reduction over tiles.
 
 use std::ops::Range;
 
 use rayon::prelude::*;
 
 use super::line::{self, both, each};
-use super::tiles::{Space, Tiles, take_input};
+use super::tiles::{TransformedTiles, WinogradTiles, take_input};
 use super::weights::{padded, place_step};
-use crate::conv3x3::parts::{Axes, Source};
+use crate::conv3x3::parts::{Axes, GatedMap};
 use crate::product::{Left, Right, padded_rows, product};
 use crate::scratch::{Scratch, Shared};
 use crate::simd::{Leaf, Simd, WIDEST, run};
 use crate::{Grid, Isa};
 
-/// Transforms of some tiles for the weights' gradient: `B^T x B` and `A dy A^T`, and the sum of `dy`.
-struct Taken<'a, const IN: usize> {
-    x: Source<'a>,
-    dy: Source<'a>,
-    tiles: Tiles,
+/// Transforms some tiles for the gradient of the weight: `B^T x B`, `A dy A^T`, and the sum of
+/// `dy`.
+struct TransformTiles<'a, const IN: usize> {
+    x: GatedMap<'a>,
+    dy: GatedMap<'a>,
+    tiles: WinogradTiles,
     range: Range<usize>,
     /// Index of the first tile within the buffers.
     index: usize,
@@ -27,19 +28,20 @@ struct Taken<'a, const IN: usize> {
     dbias: Shared,
 }
 
-impl<const IN: usize> Leaf for Taken<'_, IN> {
+impl<const IN: usize> Leaf for TransformTiles<'_, IN> {
     type Out = ();
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let space = |(start, place_step, tile_step): (Shared, usize, usize)| Space {
+        let space = |(start, place_step, tile_step): (Shared, usize, usize)| TransformedTiles {
             // The tiles from `index` on.
             start: start.pointer().wrapping_add(self.index * tile_step),
             place_step,
             tile_step,
         };
         let (v, z) = (space(self.v), space(self.z));
-        // SAFETY: tiles from `index` on are this leaf's; `dbias` holds whole vectors, this leaf's too.
+        // SAFETY: tiles from `index` on are this leaf's; `dbias` holds whole vectors, this leaf's
+        // too.
         unsafe {
             take_input::<S, IN>(self.x, self.tiles, self.range.clone(), v);
             for channel in (0..self.dy.channels).step_by(S::LANES) {
@@ -57,14 +59,14 @@ impl<const IN: usize> Leaf for Taken<'_, IN> {
                             .dy
                             .tile::<S, IN, 4>(self.tiles.grid, image, row, column, channel),
                     };
-                    let to = self.dbias.pointer().add(channel);
-                    let mut sum = S::load(to);
+                    let target = self.dbias.pointer().add(channel);
+                    let mut sum = S::load(target);
                     each!(r < IN - 2, {
                         each!(c < IN - 2, {
                             sum = S::add(sum, d[r][c]);
                         });
                     });
-                    S::store(to, sum);
+                    S::store(target, sum);
                     let m = both!(line::output_transposed::<S, IN>, S, IN, d);
                     z.store::<S, IN>(index, channel, m);
                 }
@@ -116,14 +118,14 @@ impl Leaf for Accumulate {
     }
 }
 
-/// Takes some rows (inputs) of the gradient back to `[out, in, 3, 3]`.
+/// Transforms some rows (inputs) of the gradient back to `[out, in, 3, 3]`.
 struct Unpack<'a, const IN: usize> {
     gradient: &'a [f32],
     place_step: usize,
     row_step: usize,
     axes: Axes,
     rows: Range<usize>,
-    to: Shared,
+    target: Shared,
 }
 
 impl<const IN: usize> Leaf for Unpack<'_, IN> {
@@ -147,8 +149,10 @@ impl<const IN: usize> Leaf for Unpack<'_, IN> {
                     }
                     for lane in 0..S::LANES.min(self.axes.outputs - first) {
                         for (tap, lanes) in taps.iter().enumerate() {
-                            *self.to.pointer().add(self.axes.place(k, first + lane, tap)) =
-                                lanes[lane];
+                            *self
+                                .target
+                                .pointer()
+                                .add(self.axes.place(k, first + lane, tap)) = lanes[lane];
                         }
                     }
                 }
@@ -160,11 +164,12 @@ impl<const IN: usize> Leaf for Unpack<'_, IN> {
 /// Values of both buffers of a chunk of tiles in [`gradient`].
 const CHUNK_VALUES: usize = 1 << 20;
 
-/// Tiles that one task transforms in [`gradient`]; also the stretches over which the bias is summed.
+/// Tiles that one task transforms in [`gradient`]; the bias is summed over the same stretches.
 const TASK_TILES: usize = 32;
 
-/// Gradient by the weight `[out, in, 3, 3]` and by the bias, `dy` gated where a gate is given.
-#[allow(clippy::too_many_arguments, reason = "what a gradient is made of")]
+/// Gradients with respect to the weight `[out, in, 3, 3]` and the bias. `dy` is gated if a gate is
+/// given.
+#[allow(clippy::too_many_arguments, reason = "the operands of a gradient")]
 pub(crate) fn gradient<const IN: usize>(
     isa: Isa,
     grid: Grid,
@@ -187,18 +192,18 @@ pub(crate) fn gradient<const IN: usize>(
         dy.len()
     );
     let (source, dy) = (
-        Source {
+        GatedMap {
             map: x,
             gate: None,
             channels: inputs,
         },
-        Source {
+        GatedMap {
             map: dy,
             gate,
             channels: outputs,
         },
     );
-    let tiles = Tiles::new(grid, IN - 2);
+    let tiles = WinogradTiles::new(grid, IN - 2);
     let (tall, wide) = (padded(isa, inputs), padded(isa, outputs));
     let chunk = (CHUNK_VALUES / (IN * IN * (tall + wide)))
         .next_multiple_of(TASK_TILES)
@@ -218,7 +223,7 @@ pub(crate) fn gradient<const IN: usize>(
         Shared::new(&mut u),
         Shared::new(&mut sums),
     );
-    // Rows of the gradient a task: whole row blocks, so that tasks write nothing in common.
+    // Gradient rows per task: whole row blocks, so that no two tasks write the same row.
     let row_task = if rows >= 96 { 48 } else { rows };
     for first in (0..tiles.count()).step_by(chunk) {
         let count = chunk.min(tiles.count() - first);
@@ -226,7 +231,7 @@ pub(crate) fn gradient<const IN: usize>(
             .into_par_iter()
             .for_each(|task| {
                 let index = task * TASK_TILES;
-                let leaf = Taken::<IN> {
+                let leaf = TransformTiles::<IN> {
                     x: source,
                     dy,
                     tiles,
@@ -236,7 +241,8 @@ pub(crate) fn gradient<const IN: usize>(
                     z: (z, z_step, wide),
                     dbias: sums_shared.offset(((first + index) / TASK_TILES) * wide),
                 };
-                // SAFETY: every tile of the chunk and every stretch of `sums` is written by one task.
+                // SAFETY: every tile of the chunk and every stretch of `sums` is written by one
+                // task.
                 unsafe { run(isa, leaf) }
             });
         let row_tasks = rows.div_ceil(row_task);
@@ -253,8 +259,8 @@ pub(crate) fn gradient<const IN: usize>(
                 c: u_shared.offset(place * u_step + row * wide),
                 c_step: wide,
             };
-            // SAFETY: every row of every place of `u` is written by one task; `v` has 32 values beyond its last row, and
-            // rows of `u` are padded.
+            // SAFETY: every row of every place of `u` is written by one task. `v` has 32 values
+            // beyond its last row, and the rows of `u` are padded.
             unsafe { run(isa, leaf) }
         });
     }
@@ -263,7 +269,7 @@ pub(crate) fn gradient<const IN: usize>(
         *dbias = sum as f32;
     }
     let axes = Axes::new(outputs, inputs, false);
-    let to = Shared::new(dweight);
+    let target = Shared::new(dweight);
     let step = (8192 / outputs).max(1);
     (0..inputs.div_ceil(step)).into_par_iter().for_each(|task| {
         let leaf = Unpack::<IN> {
@@ -272,7 +278,7 @@ pub(crate) fn gradient<const IN: usize>(
             row_step: wide,
             axes,
             rows: task * step..((task + 1) * step).min(inputs),
-            to,
+            target,
         };
         // SAFETY: tasks write the weights of different inputs.
         unsafe { run(isa, leaf) }

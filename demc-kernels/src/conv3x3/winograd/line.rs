@@ -1,14 +1,15 @@
-//! One-dimensional transforms of the two tile sizes, by their input length, and the way to two dimensions.
+//! One-dimensional transforms of the two tile sizes, named by their input length, and their use in
+//! two dimensions.
 
 use crate::simd::Simd;
 
 /// `B^T d`.
 ///
 /// # Safety
-/// The machine has the path of `S`; so for all here.
+/// The machine has the path of `S`; this holds for all functions here.
 #[inline(always)]
 pub(super) unsafe fn input<S: Simd, const IN: usize>(d: [S::V; IN]) -> [S::V; IN] {
-    // SAFETY: the caller's.
+    // SAFETY: guaranteed by the caller.
     unsafe {
         let mut t = d;
         if IN == 4 {
@@ -35,7 +36,7 @@ pub(super) unsafe fn input<S: Simd, const IN: usize>(d: [S::V; IN]) -> [S::V; IN
 /// `A^T m`, of which the first `IN - 2` count.
 #[inline(always)]
 pub(super) unsafe fn output<S: Simd, const IN: usize>(m: [S::V; IN]) -> [S::V; IN] {
-    // SAFETY: the caller's.
+    // SAFETY: guaranteed by the caller.
     unsafe {
         let mut y = m;
         if IN == 4 {
@@ -54,10 +55,10 @@ pub(super) unsafe fn output<S: Simd, const IN: usize>(m: [S::V; IN]) -> [S::V; I
     }
 }
 
-/// `A y`: the transposed of [`output`], of the first `IN - 2`.
+/// `A y`: the transpose of [`output`], for the first `IN - 2` values.
 #[inline(always)]
 pub(super) unsafe fn output_transposed<S: Simd, const IN: usize>(y: [S::V; IN]) -> [S::V; IN] {
-    // SAFETY: the caller's.
+    // SAFETY: guaranteed by the caller.
     unsafe {
         let mut m = y;
         if IN == 4 {
@@ -86,7 +87,7 @@ pub(super) unsafe fn output_transposed<S: Simd, const IN: usize>(y: [S::V; IN]) 
 /// `G w`, of the first 3.
 #[inline(always)]
 pub(super) unsafe fn weight<S: Simd, const IN: usize>(w: [S::V; IN]) -> [S::V; IN] {
-    // SAFETY: the caller's.
+    // SAFETY: guaranteed by the caller.
     unsafe {
         let mut u = w;
         if IN == 4 {
@@ -119,7 +120,7 @@ pub(super) unsafe fn weight<S: Simd, const IN: usize>(w: [S::V; IN]) -> [S::V; I
 /// `G^T u`, of which the first 3 count.
 #[inline(always)]
 pub(super) unsafe fn weight_transposed<S: Simd, const IN: usize>(u: [S::V; IN]) -> [S::V; IN] {
-    // SAFETY: the caller's.
+    // SAFETY: guaranteed by the caller.
     unsafe {
         let mut w = u;
         let (s1, d1) = (S::add(u[1], u[2]), S::sub(u[1], u[2]));
@@ -143,8 +144,8 @@ pub(super) unsafe fn weight_transposed<S: Simd, const IN: usize>(u: [S::V; IN]) 
     }
 }
 
-/// The body once for each `$i` below `$n` (at most 6), with `$i` known to the compiler: an array that is indexed in a
-/// loop that stays a loop lives in memory and not in registers.
+/// Expands the body once for each `$i` below `$n` (at most 6), with `$i` as a constant. An array
+/// indexed inside a real loop would live in memory instead of registers.
 macro_rules! each {
     ($i:ident < $n:expr, $body:block) => {{
         each!(@ $i, $n, $body, 0 1 2 3 4 5);

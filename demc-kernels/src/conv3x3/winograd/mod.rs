@@ -1,11 +1,13 @@
 //! 3x3 convolutions with fewer multiplications (Winograd 1980; Lavin and Gray 2016).
 //!
-//! An output tile of `OUT x OUT` pixels needs an input tile of `IN x IN`, `IN = OUT + 2`. Both are taken to a space of
-//! `IN x IN` *places* in which the convolution is one product of matrices a place, `tiles x in` times `in x out`:
-//! `Y = A^T [ (G w G^T) * (B^T x B) ] A`. F(2x2, 3x3) multiplies 2.25 times less than the plain sum and is as exact;
-//! F(4x4, 3x3) 4 times less, and loses about a digit.
+//! An output tile of `OUT x OUT` pixels needs an input tile of `IN x IN`, `IN = OUT + 2`. Both are
+//! transformed to a space of `IN x IN` *places*. There the convolution is one matrix product per
+//! place, `tiles x in` times `in x out`: `Y = A^T [ (G w G^T) * (B^T x B) ] A`.
 //!
-//! With channels last all three transforms work on vectors of channels and shuffle nothing.
+//! F(2x2, 3x3) needs 2.25 times fewer multiplications than the plain sum and is as exact. F(4x4,
+//! 3x3) needs 4 times fewer and loses about one digit.
+//!
+//! With channels last, all three transforms work on vectors of channels without shuffles.
 
 mod gradient;
 mod line;
@@ -16,44 +18,44 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::parts::{Finish, Source};
+use super::parts::{BiasRelu, GatedMap};
 use crate::Grid;
 use crate::product::{Left, Right, padded_rows, product};
 use crate::scratch::{Scratch, Shared};
 use crate::simd::{Leaf, Simd, run};
 use line::{both, each};
-use tiles::{Space, Tiles, take_input};
+use tiles::{TransformedTiles, WinogradTiles, take_input};
 use weights::place_step;
 
 pub(super) use gradient::gradient;
-pub(super) use weights::Weights;
+pub(super) use weights::WinogradWeights;
 
-/// Input transform, products, output transform of some tiles and some panels of columns.
-struct Block<'a, const IN: usize> {
-    source: Source<'a>,
-    weights: &'a Weights,
-    finish: Finish<'a>,
-    tiles: Tiles,
+/// Input transform, products and output transform of some tiles.
+struct TileBlock<'a, const IN: usize> {
+    source: GatedMap<'a>,
+    weights: &'a WinogradWeights,
+    epilogue: BiasRelu<'a>,
+    tiles: WinogradTiles,
     range: Range<usize>,
     y: Shared,
 }
 
-impl<const IN: usize> Leaf for Block<'_, IN> {
+impl<const IN: usize> Leaf for TileBlock<'_, IN> {
     type Out = ();
 
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
-        let Block {
+        let TileBlock {
             source,
             weights,
-            finish,
+            epilogue,
             tiles,
             range,
             y,
         } = self;
         let (depth, columns, out) = (weights.depth, weights.columns, IN - 2);
         let (count, rows) = (range.len(), padded_rows(range.len()));
-        let space = |scratch: &mut Scratch, channels: usize| Space {
+        let space = |scratch: &mut Scratch, channels: usize| TransformedTiles {
             start: scratch.as_mut_ptr(),
             place_step: place_step(rows * channels),
             tile_step: channels,
@@ -65,7 +67,8 @@ impl<const IN: usize> Leaf for Block<'_, IN> {
         let mut input = Scratch::take(IN * IN * place_step(rows * tall));
         let mut output = Scratch::take(IN * IN * place_step(rows * wide));
         let (v, m) = (space(&mut input, tall), space(&mut output, wide));
-        // SAFETY: the scratch buffers hold `rows` tiles a place; the tiles of `range` are this leaf's to write in `y`.
+        // SAFETY: the scratch buffers hold `rows` tiles a place; the tiles of `range` are this
+        // leaf's to write in `y`.
         unsafe {
             take_input::<S, IN>(source, tiles, range.clone(), v);
             for place in 0..IN * IN {
@@ -82,12 +85,12 @@ impl<const IN: usize> Leaf for Block<'_, IN> {
                 let (image, row, column) = tiles.at(tile);
                 let whole = row + out <= tiles.grid.height && column + out <= tiles.grid.width;
                 let line = tiles.grid.width * columns;
-                let to = y
+                let target = y
                     .pointer()
                     .add((image + row * tiles.grid.width + column) * columns);
                 for channel in (0..columns).step_by(S::LANES) {
                     let n = S::LANES.min(columns - channel);
-                    let bias = finish.bias::<S>(channel, n);
+                    let bias = epilogue.bias::<S>(channel, n);
                     let mut result = both!(
                         line::output::<S, IN>,
                         S,
@@ -97,14 +100,14 @@ impl<const IN: usize> Leaf for Block<'_, IN> {
                     each!(r < out, {
                         each!(c < out, {
                             let value = S::add(result[r][c], bias);
-                            result[r][c] = if finish.relu { S::relu(value) } else { value };
+                            result[r][c] = if epilogue.relu { S::relu(value) } else { value };
                         });
                     });
-                    let to = to.add(channel);
+                    let target = target.add(channel);
                     if whole && n == S::LANES {
                         each!(r < out, {
                             each!(c < out, {
-                                S::store(to.add(r * line + c * columns), result[r][c]);
+                                S::store(target.add(r * line + c * columns), result[r][c]);
                             });
                         });
                     } else {
@@ -116,7 +119,7 @@ impl<const IN: usize> Leaf for Block<'_, IN> {
                                 .iter()
                                 .enumerate()
                             {
-                                S::store_part(to.add(r * line + c * columns), n, *value);
+                                S::store_part(target.add(r * line + c * columns), n, *value);
                             }
                         }
                     }
@@ -126,55 +129,56 @@ impl<const IN: usize> Leaf for Block<'_, IN> {
     }
 }
 
-/// Values of a block's two buffers that the second-level cache of today's cores holds beside the weights of a place.
+/// Values of a block's two buffers that a second-level cache holds beside the weights of one place.
 const BLOCK_VALUES: usize = 128 << 10;
 
-/// Most tiles of a block.
+/// Maximum number of tiles in a block.
 const MOST_TILES: usize = 192;
 
-/// Fewest tiles of a block, below which loading the weights takes longer than using them.
+/// Minimum number of tiles in a block. With fewer, loading the weights takes longer than using
+/// them.
 const FEWEST_TILES: usize = 48;
 
-/// Tiles of a block, for as many blocks as keeps all threads at work.
+/// Tiles per block, chosen so that the number of blocks keeps all threads busy.
 fn block_tiles(tiles: usize, values_per_tile: usize, weights: usize) -> usize {
-    // Where the weights fall out of the second-level cache, more tiles use them while they are there.
+    // If the weights exceed the second-level cache, more tiles use them while they are cached.
     let fewest = if weights > 4 * BLOCK_VALUES {
         MOST_TILES / 2
     } else {
         FEWEST_TILES
     };
-    let most = (BLOCK_VALUES / values_per_tile).clamp(fewest, MOST_TILES);
+    let limit = (BLOCK_VALUES / values_per_tile).clamp(fewest, MOST_TILES);
     let threads = rayon::current_num_threads();
-    let blocks = tiles.div_ceil(most).next_multiple_of(threads);
+    let blocks = tiles.div_ceil(limit).next_multiple_of(threads);
     tiles.div_ceil(blocks)
 }
 
-/// `y = finish(w * x)`, `x` gated where a gate is given.
+/// `y = epilogue(w * x)`; `x` is gated if a gate is given.
 ///
 /// # Panics
-/// Where a length is not that of its map.
+/// If a length does not match its map.
 pub(crate) fn convolve<const IN: usize>(
     grid: Grid,
     x: &[f32],
     gate: Option<&[f32]>,
-    weights: &Weights,
-    finish: Finish,
+    weights: &WinogradWeights,
+    epilogue: BiasRelu,
     y: &mut [f32],
 ) {
-    convolve_rows::<IN>(grid, x, gate, 0, weights, finish, y);
+    convolve_rows::<IN>(grid, x, gate, 0, weights, epilogue, y);
 }
 
-/// The same of the rows from `above` on, as many as `y` has; `grid` is that of `x`.
+/// As [`convolve`], for the rows from `above` on, as many as `y` has. `grid` is the grid of `x`.
 ///
 /// # Panics
-/// Where a length is not that of its map, or `x` does not have those rows.
+/// If a length does not match its map, or `x` lacks those rows.
 pub(crate) fn convolve_rows<const IN: usize>(
     grid: Grid,
     x: &[f32],
     gate: Option<&[f32]>,
     above: usize,
-    weights: &Weights,
-    finish: Finish,
+    weights: &WinogradWeights,
+    epilogue: BiasRelu,
     y: &mut [f32],
 ) {
     let (depth, columns) = (weights.depth, weights.columns);
@@ -199,12 +203,12 @@ pub(crate) fn convolve_rows<const IN: usize>(
         "the gate of a map of {} values",
         x.len()
     );
-    let source = Source {
+    let source = GatedMap {
         map: x,
         gate,
         channels: depth,
     };
-    let tiles = Tiles::of_rows(grid, above, height, IN - 2);
+    let tiles = WinogradTiles::of_rows(grid, above, height, IN - 2);
     let step = block_tiles(
         tiles.count(),
         IN * IN * (depth + columns),
@@ -215,15 +219,16 @@ pub(crate) fn convolve_rows<const IN: usize>(
         .into_par_iter()
         .for_each(|task| {
             let range = task * step..((task + 1) * step).min(tiles.count());
-            let leaf = Block::<IN> {
+            let leaf = TileBlock::<IN> {
                 source,
                 weights,
-                finish,
+                epilogue,
                 tiles,
                 range,
                 y,
             };
-            // SAFETY: every tile of `y` is written by one task; `source` and the weights have the lengths checked above.
+            // SAFETY: every tile of `y` is written by one task; `source` and the weights have the
+            // lengths checked above.
             unsafe { run(weights.isa, leaf) }
         });
 }

@@ -1,36 +1,36 @@
-//! Tiles of maps, and their places in the space of the products.
+//! Tiles of maps, and their places in the transformed space.
 
 use std::ops::Range;
 
 use super::line::{self, both, each};
 use crate::Grid;
-use crate::conv3x3::parts::Source;
+use crate::conv3x3::parts::GatedMap;
 use crate::simd::Simd;
 
 /// The tiles that cover a grid.
 #[derive(Clone, Copy)]
-pub(super) struct Tiles {
-    /// Of the output.
+pub(super) struct WinogradTiles {
+    /// Grid of the output.
     pub(super) grid: Grid,
-    /// Of the input: more rows where the output is a band of an image.
+    /// Grid of the input, with more rows where the output is a band of an image.
     pub(super) input: Grid,
-    /// Rows of the input above the output's first.
+    /// Rows of the input above the first row of the output.
     pub(super) above: usize,
     pub(super) out: usize,
     pub(super) down: usize,
     pub(super) across: usize,
 }
 
-impl Tiles {
+impl WinogradTiles {
     pub(super) fn new(grid: Grid, out: usize) -> Self {
-        Tiles::of_rows(grid, 0, grid.height, out)
+        WinogradTiles::of_rows(grid, 0, grid.height, out)
     }
 
-    /// Those of `height` rows from `above` on.
+    /// The tiles of `height` rows from `above` on.
     pub(super) fn of_rows(input: Grid, above: usize, height: usize, out: usize) -> Self {
         let grid = Grid { height, ..input };
         let (down, across) = (height.div_ceil(out), grid.width.div_ceil(out));
-        Tiles {
+        WinogradTiles {
             grid,
             input,
             above,
@@ -44,7 +44,7 @@ impl Tiles {
         self.grid.batch * self.down * self.across
     }
 
-    /// First pixel of the image, row and column of a tile's output.
+    /// First pixel of the image, and row and column of a tile's output.
     pub(super) fn at(self, tile: usize) -> (usize, usize, usize) {
         let (image, rest) = (
             tile / (self.down * self.across),
@@ -58,8 +58,8 @@ impl Tiles {
         )
     }
 
-    /// First pixel of the input's image, row and column there of a tile's input, which begins a row and a column before
-    /// its output.
+    /// First pixel of the input image, and row and column of a tile's input, which starts one row
+    /// and one column before its output.
     pub(super) fn input_at(self, tile: usize) -> (usize, isize, isize) {
         let (_, row, column) = self.at(tile);
         let first = tile / (self.down * self.across) * self.input.height * self.input.width;
@@ -67,8 +67,9 @@ impl Tiles {
     }
 }
 
-impl Source<'_> {
-    /// The `size x size` pixels of a tile from `(row, column)` of the image at `image`, zeros where there is none.
+impl GatedMap<'_> {
+    /// The `size x size` pixels of a tile from `(row, column)` of the image at `image`; zeros
+    /// outside the image.
     ///
     /// # Safety
     /// The machine has the path of `S`.
@@ -106,8 +107,9 @@ impl Source<'_> {
                         each!(r < SIZE, {
                             let (map, gate) = (map.add(r * line), gate.add(r * line));
                             each!(c < SIZE, {
-                                let at = c * self.channels;
-                                d[r][c] = S::gate(S::load(map.add(at)), S::load(gate.add(at)));
+                                let offset = c * self.channels;
+                                d[r][c] =
+                                    S::gate(S::load(map.add(offset)), S::load(gate.add(offset)));
                             });
                         });
                     }
@@ -117,18 +119,18 @@ impl Source<'_> {
                 for r in 0..SIZE {
                     for c in 0..SIZE {
                         let (y, x) = (row + r as isize, column + c as isize);
-                        let there = y >= 0
+                        let inside = y >= 0
                             && x >= 0
                             && (y as usize) < grid.height
                             && (x as usize) < grid.width;
-                        if there {
+                        if inside {
                             let pixel = image + y as usize * grid.width + x as usize;
-                            let at = pixel * self.channels + channel;
-                            let value = S::load_part(self.map.as_ptr().add(at), n);
+                            let offset = pixel * self.channels + channel;
+                            let value = S::load_part(self.map.as_ptr().add(offset), n);
                             d[r][c] = match self.gate {
                                 None => value,
                                 Some(gate) => {
-                                    S::gate(value, S::load_part(gate.as_ptr().add(at), n))
+                                    S::gate(value, S::load_part(gate.as_ptr().add(offset), n))
                                 }
                             };
                         }
@@ -140,16 +142,16 @@ impl Source<'_> {
     }
 }
 
-/// Tiles of a map in the space of the products: `[place][tile][channel]`.
+/// Transformed tiles of a map: `[place][tile][channel]`.
 #[derive(Clone, Copy)]
-pub(super) struct Space {
+pub(super) struct TransformedTiles {
     pub(super) start: *mut f32,
     pub(super) place_step: usize,
     pub(super) tile_step: usize,
 }
 
-impl Space {
-    /// Puts a vector of channels of a tile to its places.
+impl TransformedTiles {
+    /// Stores one vector of channels of a tile.
     ///
     /// # Safety
     /// The machine has the path of `S`, and the tile is the caller's to write.
@@ -160,29 +162,29 @@ impl Space {
         channel: usize,
         v: [[S::V; IN]; IN],
     ) {
-        // SAFETY: the caller's.
+        // SAFETY: guaranteed by the caller.
         unsafe {
-            let to = self.start.add(tile * self.tile_step + channel);
+            let target = self.start.add(tile * self.tile_step + channel);
             each!(r < IN, {
-                let to = to.add(r * IN * self.place_step);
+                let target = target.add(r * IN * self.place_step);
                 each!(c < IN, {
-                    S::store(to.add(c * self.place_step), v[r][c]);
+                    S::store(target.add(c * self.place_step), v[r][c]);
                 });
             });
         }
     }
 
-    /// Gets them.
+    /// Loads one vector of channels of a tile.
     ///
     /// # Safety
-    /// As for `store`, to read.
+    /// As for [`store`](Self::store), for reading.
     #[inline(always)]
     pub(super) unsafe fn load<S: Simd, const IN: usize>(
         self,
         tile: usize,
         channel: usize,
     ) -> [[S::V; IN]; IN] {
-        // SAFETY: the caller's.
+        // SAFETY: guaranteed by the caller.
         unsafe {
             let from = self.start.add(tile * self.tile_step + channel);
             let mut v = [[S::zero(); IN]; IN];
@@ -200,22 +202,22 @@ impl Space {
 /// `B^T x B` of some tiles.
 ///
 /// # Safety
-/// The machine has the path of `S`, and the tiles from `to` on are the caller's to write.
+/// The machine has the path of `S`, and the tiles from `target` on are the caller's to write.
 #[inline(always)]
 pub(super) unsafe fn take_input<S: Simd, const IN: usize>(
-    source: Source,
-    tiles: Tiles,
+    source: GatedMap,
+    tiles: WinogradTiles,
     range: Range<usize>,
-    to: Space,
+    target: TransformedTiles,
 ) {
     for (index, tile) in range.enumerate() {
         let (image, row, column) = tiles.input_at(tile);
         for channel in (0..source.channels).step_by(S::LANES) {
-            // SAFETY: the caller's.
+            // SAFETY: guaranteed by the caller.
             unsafe {
                 let d = source.tile::<S, IN, IN>(tiles.input, image, row, column, channel);
                 let v = both!(line::input::<S, IN>, S, IN, d);
-                to.store::<S, IN>(index, channel, v);
+                target.store::<S, IN>(index, channel, v);
             }
         }
     }

@@ -1,4 +1,4 @@
-//! Weights in the space of the products.
+//! Weights in the transformed space.
 
 use std::ops::Range;
 
@@ -11,8 +11,8 @@ use crate::product::Panels;
 use crate::scratch::{Scratch, Shared};
 use crate::simd::{Leaf, Simd, WIDEST, run};
 
-/// Weights in the space of the products.
-pub(crate) struct Weights {
+/// Weights in the transformed space.
+pub(crate) struct WinogradWeights {
     pub(super) isa: Isa,
     pub(super) depth: usize,
     pub(super) columns: usize,
@@ -20,16 +20,16 @@ pub(crate) struct Weights {
     pub(super) values: Scratch,
 }
 
-/// Takes some rows of the weights to the space of the products.
-struct Pack<'a, const IN: usize> {
+/// Transforms some rows of the weights.
+struct TransformWeights<'a, const IN: usize> {
     weight: &'a [f32],
     axes: Axes,
     rows: Range<usize>,
-    to: Shared,
+    target: Shared,
     place_step: usize,
 }
 
-impl<const IN: usize> Leaf for Pack<'_, IN> {
+impl<const IN: usize> Leaf for TransformWeights<'_, IN> {
     type Out = ();
 
     #[inline(always)]
@@ -43,20 +43,23 @@ impl<const IN: usize> Leaf for Pack<'_, IN> {
                         lanes[lane] = self.weight[self.axes.place(k, first + lane, tap)];
                     }
                 }
-                // SAFETY: `taps` holds a vector a tap; `to` holds IN * IN places of a whole vector here, which belong to
-                // this row alone.
+                // SAFETY: `taps` holds one vector per tap. `target` has room for IN * IN places of a
+                // whole vector, which belong to this row alone.
                 unsafe {
                     let mut w = [[S::zero(); IN]; IN];
                     for (tap, lanes) in taps.iter().enumerate() {
                         w[tap / 3][tap % 3] = S::load(lanes.as_ptr());
                     }
                     let u = both!(line::weight::<S, IN>, S, IN, w);
-                    let to = self
-                        .to
-                        .pointer()
-                        .add(panels.place(self.axes.inputs, k, first));
+                    let target =
+                        self.target
+                            .pointer()
+                            .add(panels.place(self.axes.inputs, k, first));
                     for place in 0..IN * IN {
-                        S::store(to.add(place * self.place_step), u[place / IN][place % IN]);
+                        S::store(
+                            target.add(place * self.place_step),
+                            u[place / IN][place % IN],
+                        );
                     }
                 }
             }
@@ -81,13 +84,15 @@ pub(super) fn padded(isa: Isa, columns: usize) -> usize {
     unsafe { run(isa, Padded(columns)) }
 }
 
-/// Distance between places: an odd number of cache lines, so that the places of a tile fall into different sets.
+/// Distance between places: an odd number of cache lines, so that the places of a tile map to
+/// different cache sets.
 pub(super) fn place_step(values: usize) -> usize {
     values.next_multiple_of(16) + 16
 }
 
-impl Weights {
-    /// Of a weight `[out, in, 3, 3]`; `transposed` for the gradient by the input.
+impl WinogradWeights {
+    /// Transforms a weight `[out, in, 3, 3]`; `transposed` for the gradient with respect to the
+    /// input.
     pub(crate) fn new<const IN: usize>(
         isa: Isa,
         weight: &[f32],
@@ -98,23 +103,23 @@ impl Weights {
         let axes = Axes::new(outputs, inputs, transposed);
         let place_step = place_step(axes.inputs * padded(isa, axes.outputs));
         let mut values = Scratch::take(IN * IN * place_step);
-        let to = Shared::new(&mut values);
+        let target = Shared::new(&mut values);
         let step = (8192 / axes.outputs).max(1);
         (0..axes.inputs.div_ceil(step))
             .into_par_iter()
             .for_each(|task| {
                 let rows = task * step..((task + 1) * step).min(axes.inputs);
-                let leaf = Pack::<IN> {
+                let leaf = TransformWeights::<IN> {
                     weight,
                     axes,
                     rows,
-                    to,
+                    target,
                     place_step,
                 };
                 // SAFETY: tasks write different rows, all of them within `values`.
                 unsafe { run(isa, leaf) }
             });
-        Weights {
+        WinogradWeights {
             isa,
             depth: axes.inputs,
             columns: axes.outputs,

@@ -1,11 +1,10 @@
-//! The kernels on `flex`.
+//! The kernels on `flex`: the forward pass.
 
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use demc_kernels::{Grid, Isa, batch_norm, conv1x1, conv3x3, deconv4x4, grid, pool, rel_mse};
 
-use super::KernelOps;
-use super::slices::{buffer, contiguous, dims, grid, maps, tensor, values};
+use super::{KernelOps, buffer, contiguous, dims, grid, maps, tensor, values};
 
 impl KernelOps for Flex {
     fn nhwc_from_nchw(x: FlexTensor) -> FlexTensor {
@@ -157,8 +156,10 @@ impl KernelOps for Flex {
     }
 }
 
-/// The loss of each image, `[B]`; their gradients by the output into `dout` where asked. Both tensors are
-/// [`contiguous`], `[B, C, H, W]`.
+/// The loss of each image. Writes the gradient with respect to the output into `dout` where given.
+///
+/// # Shapes
+/// Two [`contiguous`] `[B, C, H, W]` to `[B]`; `dout` has the values of `[B, C, H, W]`.
 pub(super) fn rel_mse_into(
     out_gamma: &FlexTensor,
     ref_hdr: &FlexTensor,
@@ -187,6 +188,7 @@ pub(super) fn rel_mse_into(
     tensor(losses, [batch])
 }
 
+/// The 1x1 convolution of the concatenation of `parts`.
 pub(super) fn fuse<const P: usize>(
     parts: [FlexTensor; P],
     weight: FlexTensor,

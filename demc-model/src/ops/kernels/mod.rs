@@ -1,20 +1,22 @@
-//! The kernels as operations of Burn: a backend extension for `flex`, plain and under autodiff.
+//! The kernels as Burn operations: a backend extension for `flex`, with and without autodiff.
 //!
-//! The functions here take and give Burn's tensors. Burn routes each of them to [`KernelOps`] of the backend at hand:
-//! `flex` runs the kernel on slices (`forward`), `flex` under autodiff also records how to go back (`backward`).
-//! Maps are `[B, H, W, C]`, contiguous; weights are as in weight files.
+//! The functions here take and return Burn's tensors. Burn calls [`KernelOps`] of the tensor's
+//! backend. `flex` runs the kernel on slices (`forward`). `flex` under autodiff also records the
+//! backward pass (`backward`). Maps are `[B, H, W, C]` and contiguous; weights have the layout of
+//! weight files.
 
 mod backward;
 mod forward;
-pub(super) mod slices;
 
+use burn::backend::flex::FlexTensor;
 use burn::backend::{Backend, Dispatch, backend_extension, tensor::FloatTensor};
 use burn::nn::BatchNorm;
-use burn::tensor::Tensor;
+use burn::tensor::{Tensor, TensorData};
+use demc_kernels::Grid;
 
 use super::Activation;
 
-/// What a backend must have to run the kernels.
+/// The operations that a backend needs to run the kernels.
 #[backend_extension(Flex, Autodiff)]
 pub(super) trait KernelOps: Backend {
     /// `[B, C, H, W]` to `[B, H, W, C]`.
@@ -54,7 +56,7 @@ pub(super) trait KernelOps: Backend {
     ) -> FloatTensor<Self>;
     /// 2x2, stride 2.
     fn max_pool(x: FloatTensor<Self>) -> FloatTensor<Self>;
-    /// With the given statistics; never differentiated.
+    /// With the given statistics; not differentiable.
     fn batch_norm(
         x: FloatTensor<Self>,
         gamma: FloatTensor<Self>,
@@ -64,7 +66,8 @@ pub(super) trait KernelOps: Backend {
         epsilon: f32,
         relu: bool,
     ) -> FloatTensor<Self>;
-    /// With the batch's statistics, which come second and third and have no gradient.
+    /// With the batch's statistics. Returns the maps, the mean and the variance; the latter two
+    /// have no gradient.
     fn batch_norm_train(
         x: FloatTensor<Self>,
         gamma: FloatTensor<Self>,
@@ -152,7 +155,7 @@ pub(super) fn batch_norm(x: Tensor<4>, norm: &BatchNorm, activation: Activation)
     ))
 }
 
-/// The normalised maps, and the batch's mean and variance.
+/// The normalised maps, and the mean and variance of the batch.
 pub(super) fn batch_norm_train(
     x: Tensor<4>,
     norm: &BatchNorm,
@@ -181,4 +184,48 @@ pub(super) fn rel_mse_of_gamma(
         gamma,
         epsilon,
     ))
+}
+
+/// The tensor with its values row by row in a buffer of exactly their size. Maps and weights have
+/// this layout already and are not copied.
+pub(super) fn contiguous(tensor: FlexTensor) -> FlexTensor {
+    // This clones only a reference, which is dropped on return.
+    tensor.to_contiguous()
+}
+
+/// The values of a [`contiguous`] tensor.
+pub(super) fn values(tensor: &FlexTensor) -> &[f32] {
+    tensor.storage::<f32>()
+}
+
+/// A buffer of `len` values to write; its initial values are arbitrary.
+fn buffer(len: usize) -> Vec<f32> {
+    demc_kernels::memory::buffer(len)
+}
+
+/// The tensor with these values.
+fn tensor<const D: usize>(values: Vec<f32>, shape: [usize; D]) -> FlexTensor {
+    FlexTensor::from_data(TensorData::new(values, shape))
+}
+
+/// The axes of a tensor.
+fn dims<const D: usize>(tensor: &FlexTensor) -> [usize; D] {
+    tensor.layout().shape().dims()
+}
+
+/// The grid and the number of channels of maps `[B, H, W, C]`.
+fn grid(maps: &FlexTensor) -> (Grid, usize) {
+    let [batch, height, width, channels] = dims(maps);
+    let grid = Grid {
+        batch,
+        height,
+        width,
+    };
+    (grid, channels)
+}
+
+/// The tensor of these maps on `grid`.
+fn maps(grid: Grid, values: Vec<f32>) -> FlexTensor {
+    let channels = grid.channels(values.len());
+    tensor(values, [grid.batch, grid.height, grid.width, channels])
 }

@@ -1,4 +1,4 @@
-//! The way back through whatever has weights: convolutions, deconvolutions, skip fusions.
+//! The backward pass of the operations with weights: convolutions, deconvolutions, skip fusions.
 
 use burn::backend::Flex;
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
@@ -7,18 +7,18 @@ use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::flex::FlexTensor;
 use demc_kernels::{Grid, Isa, conv1x1, conv3x3, deconv4x4};
 
-use super::super::slices::{buffer, contiguous, dims, grid, maps, tensor, values};
+use super::super::{buffer, contiguous, dims, grid, maps, tensor, values};
 
-/// What a convolution of `P` inputs keeps.
+/// The state that a convolution of `P` inputs keeps for its backward pass.
 #[derive(Clone, Debug)]
 pub(super) struct ConvState<const P: usize> {
     pub(super) inputs: [FlexTensor; P],
     pub(super) weight: FlexTensor,
-    /// The output, where it was rectified.
+    /// The output, where a ReLU follows.
     pub(super) y: Option<FlexTensor>,
 }
 
-/// What a convolution's kernel takes on the way back.
+/// The arguments of a convolution kernel's backward pass.
 struct ConvGradients<'a, const P: usize> {
     grid: Grid,
     inputs: [&'a [f32]; P],
@@ -30,10 +30,12 @@ struct ConvGradients<'a, const P: usize> {
     dbias: &'a mut [f32],
 }
 
-/// The way back through a convolution: `kernel` fills buffers, which are registered where somebody asks for them.
+/// The backward pass of a convolution. `kernel` fills the buffers; those with a node are
+/// registered.
 ///
-/// The nodes are those of the inputs, the weight and the bias; the weight's axis `output_axis` is the output's channels.
-fn convolution_back<const P: usize, const N: usize>(
+/// The nodes belong to the inputs, the weight and the bias, in this order. The weight's axis
+/// `output_axis` has the output channels.
+fn backward_convolution<const P: usize, const N: usize>(
     ops: Ops<ConvState<P>, N>,
     grads: &mut Gradients,
     output_axis: usize,
@@ -48,8 +50,8 @@ fn convolution_back<const P: usize, const N: usize>(
     let (grid, _) = grid(&inputs[0]);
     let shape = dims::<4>(&weight);
     let mut dinputs: [_; P] = std::array::from_fn(|i| {
-        let asked = input_nodes[i].as_ref();
-        asked.map(|_| buffer(values(&inputs[i]).len()))
+        let node = input_nodes[i].as_ref();
+        node.map(|_| buffer(values(&inputs[i]).len()))
     });
     let mut dweight = buffer(values(&weight).len());
     let mut dbias = buffer(shape[output_axis]);
@@ -83,7 +85,7 @@ impl Backward<Flex, 3> for Conv3x3 {
     type State = ConvState<1>;
 
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
-        convolution_back(ops, grads, 0, |g| {
+        backward_convolution(ops, grads, 0, |g| {
             let ([x], [dx]) = (g.inputs, g.dinputs);
             conv3x3::backward(
                 Isa::current(),
@@ -107,7 +109,7 @@ impl Backward<Flex, 3> for Deconv4x4 {
     type State = ConvState<1>;
 
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
-        convolution_back(ops, grads, 1, |g| {
+        backward_convolution(ops, grads, 1, |g| {
             let ([x], [dx]) = (g.inputs, g.dinputs);
             deconv4x4::backward(
                 Isa::current(),
@@ -124,7 +126,7 @@ impl Backward<Flex, 3> for Deconv4x4 {
     }
 }
 
-/// A fusion of `P` parts, whose `N` nodes are the parts', the weight's and the bias's.
+/// A fusion of `P` parts. Its `N` nodes belong to the parts, the weight and the bias.
 #[derive(Debug)]
 pub(super) struct Fuse<const P: usize>;
 
@@ -132,7 +134,7 @@ impl<const P: usize, const N: usize> Backward<Flex, N> for Fuse<P> {
     type State = ConvState<P>;
 
     fn backward(self, ops: Ops<Self::State, N>, grads: &mut Gradients, _: &mut Checkpointer) {
-        convolution_back(ops, grads, 0, |mut g| {
+        backward_convolution(ops, grads, 0, |mut g| {
             conv1x1::backward(
                 Isa::current(),
                 g.grid,

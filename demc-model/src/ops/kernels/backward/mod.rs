@@ -1,7 +1,9 @@
-//! The kernels on `flex` under autodiff: what each forward pass keeps, and the way back.
+//! The kernels on `flex` under autodiff: the state that each operation keeps, and the backward
+//! pass.
 //!
-//! A step keeps tensors, not copies: `flex` shares memory by reference count, and what one operation keeps as its output is
-//! what the next one keeps as its input. A gradient that nobody asks for (by the network's inputs) is not computed.
+//! An operation keeps tensors, not copies: `flex` shares memory by reference count. One operation's
+//! output and the next one's input are one buffer. Gradients with respect to the network's inputs
+//! are not computed.
 
 mod convolution;
 
@@ -13,9 +15,8 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, AutodiffBackend, Flex};
 use demc_kernels::{Isa, batch_norm, pool};
 
-use super::KernelOps;
 use super::forward::{fuse, rel_mse_into};
-use super::slices::{buffer, contiguous, dims, grid, maps, tensor, values};
+use super::{KernelOps, buffer, contiguous, dims, grid, maps, tensor, values};
 use convolution::{Conv3x3, ConvState, Deconv4x4, Fuse};
 
 /// A tensor of `flex` under autodiff.
@@ -111,7 +112,7 @@ impl<C: CheckpointStrategy> KernelOps for Autodiff<Flex, C> {
     fn rel_mse_of_gamma(out_gamma: Tracked, ref_hdr: Tracked, gamma: f32, epsilon: f32) -> Tracked {
         let ([out_gamma], nodes) = parts([out_gamma]);
         let ref_hdr = contiguous(ref_hdr.into_primitive());
-        // With the loss, its gradient: the root and the power are those of the loss.
+        // The gradient is computed with the loss: both need the same powers.
         let mut dout = buffer(values(&out_gamma).len());
         let loss = rel_mse_into(&out_gamma, &ref_hdr, gamma, epsilon, Some(&mut dout));
         let dout = tensor(dout, dims::<4>(&out_gamma));
@@ -127,22 +128,22 @@ fn parts<const N: usize>(tensors: [Tracked; N]) -> ([FlexTensor; N], [NodeGuard;
         nodes.push(node);
         contiguous(tensor)
     });
-    let nodes = nodes.try_into().expect("a node a tensor");
+    let nodes = nodes.try_into().expect("one node per tensor");
     (tensors, nodes)
 }
 
-/// Records `step` with what it keeps, where any of its inputs has a gradient.
-fn record<S, C, const N: usize>(
-    step: S,
+/// Records `operation` with its state if any of its inputs has a gradient.
+fn record<O, C, const N: usize>(
+    operation: O,
     nodes: [NodeGuard; N],
     output: FlexTensor,
-    state: impl FnOnce(&FlexTensor) -> S::State,
+    state: impl FnOnce(&FlexTensor) -> O::State,
 ) -> Tracked
 where
-    S: Backward<Flex, N>,
+    O: Backward<Flex, N>,
     C: CheckpointStrategy,
 {
-    match step.prepare::<C>(nodes).compute_bound().stateful() {
+    match operation.prepare::<C>(nodes).compute_bound().stateful() {
         OpsKind::Tracked(prep) => {
             let state = state(&output);
             prep.finish(state, output)
@@ -188,7 +189,7 @@ impl Backward<Flex, 1> for MaxPool {
 #[derive(Debug)]
 struct BatchNorm;
 
-/// What a batch normalisation keeps.
+/// The state that a batch normalisation keeps for its backward pass.
 #[derive(Clone, Debug)]
 struct NormState {
     x: FlexTensor,
@@ -196,7 +197,7 @@ struct NormState {
     /// Mean and variance of the batch.
     statistics: [FlexTensor; 2],
     epsilon: f32,
-    /// The output, where it was rectified.
+    /// The output, where a ReLU follows.
     y: Option<FlexTensor>,
 }
 
@@ -228,12 +229,12 @@ impl Backward<Flex, 3> for BatchNorm {
             &mut dgamma,
             &mut dbeta,
         );
-        let found = [
+        let gradients = [
             maps(grid, dx),
             tensor(dgamma, [channels]),
             tensor(dbeta, [channels]),
         ];
-        for (node, gradient) in ops.parents.into_iter().zip(found) {
+        for (node, gradient) in ops.parents.into_iter().zip(gradients) {
             if let Some(node) = node {
                 grads.register::<Flex>(node.id, gradient);
             }
@@ -241,7 +242,7 @@ impl Backward<Flex, 3> for BatchNorm {
     }
 }
 
-/// The way between channels first and channels last, which is back again the other way.
+/// The conversion between channels first and channels last. The backward pass is the inverse.
 #[derive(Debug)]
 enum Relayout {
     ToNhwc,
@@ -268,7 +269,7 @@ impl Backward<Flex, 1> for Relayout {
 struct RelMse;
 
 impl Backward<Flex, 1> for RelMse {
-    /// Each image's loss's gradient by its output, `[B, C, H, W]`.
+    /// The gradient of each image's loss with respect to the output, `[B, C, H, W]`.
     type State = FlexTensor;
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {

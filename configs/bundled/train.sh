@@ -1,0 +1,118 @@
+#!/bin/sh
+# Trains a model like the bundled one: renders the data, runs the 12 stages, exports the weights.
+#
+#   configs/bundled/train.sh [--base DIR]   7.5 hours of training and 3 hours of rendering on 2 cores
+#   configs/bundled/train.sh --try          2 steps per stage on data/sample, about 1 minute
+#
+# --base is the data set that the rendered views are added to, by default data/renders. That set (89
+# training and 19 test scenes) is not in the repository; data/sample is a part of it. DIR starts at the
+# repository root.
+#
+# Run it from any directory. It needs demc-train and demc-infer on the PATH. Rendering also needs
+# Python with mitsuba, numpy, OpenEXR, and pyoidn; PYTHON names the interpreter. Rerun the script to
+# resume it: complete data sets and stages are skipped.
+#
+# The result resembles models/demc.safetensors but has other weights:
+# - The original stages 1 to 8 filtered the references during training (data.reference_filter).
+#   Here references.py cleans them.
+# - The original runs set train.lr_fan_in = 96 and train.recycle = 1000. Both keys are removed.
+# - The original references of stages 9 to 11 were cleaned with guides that were not denoised.
+# - Stages 9 and 12 started from a half-precision export of the stage before.
+set -eu
+
+usage() {
+    echo "usage: $0 [--try | --base DIR]" >&2
+    exit 2
+}
+
+base=data/renders
+steps=
+while [ $# -gt 0 ]; do
+    case $1 in
+    --try) steps=2 ;;
+    --base)
+        [ $# -gt 1 ] || usage
+        base=$2
+        shift
+        ;;
+    *) usage ;;
+    esac
+    shift
+done
+
+cd "$(dirname "$0")/../.."
+repository=$PWD
+python=${PYTHON:-python3}
+
+# Renders views and lists them together with the scenes of another data set:
+# render NAME OTHER_DATA OPTION...
+render() {
+    name=$1 other=$2
+    shift 2
+    [ -e "data/bundled/$name/complete" ] && return
+    echo "== rendering data/bundled/$name"
+    "$python" python/render -o "data/bundled/$name" --with "$other" "$@"
+    touch "data/bundled/$name/complete"
+}
+
+# Denoises the references of a data set: clean NAME RENDERED
+clean() {
+    [ -e "data/bundled/$1/complete" ] && return
+    echo "== cleaning the references of data/bundled/$2"
+    "$python" python/tools/references.py --data "data/bundled/$2" -o "data/bundled/$1"
+    touch "data/bundled/$1/complete"
+}
+
+render_all() {
+    [ -e "$base/manifest.json" ] || {
+        echo "error: $base/manifest.json: no such file; --base names another data set" >&2
+        exit 1
+    }
+    set_of() { echo "data/bundled/$1"; }
+
+    # Stages 1 to 8: 836 views of rooms and 337 of still lifes.
+    render a1 "$base" --rooms 145 --grain 0 --black 0 --sun 0 --seed 2
+    render a2 "$(set_of a1)" --rooms 107 --grain 0 --black 0 --sun 1 --seed 3
+    render a3 "$(set_of a2)" --rooms 31 --grain 0 --black 0 --sun 1 --seed 4
+    render a4 "$(set_of a3)" --rooms 129 --grain 0.8 --black 0 --sun 0.8 --seed 5
+    render a5 "$(set_of a4)" --rooms 220 --grain 0.6 --black 0.7 --sun 1 --seed 6
+    render a6 "$(set_of a5)" --stills 170 --studio 0 --seed 7
+    clean clean-a a6
+
+    # Stages 9 to 11: 739 other views, with albedo and normals of the reference's samples.
+    render b1 "$base" --rooms 110 --black 0.6 --sun 1 --seed 21 --ref-spp 96
+    render b2 "$(set_of b1)" --stills 60 --studio 0 --seed 22 --ref-spp 96
+    render b3 "$(set_of b2)" --rooms 100 --black 0.3 --sun 0.8 --seed 23 --ref-spp 96
+    render b4 "$(set_of b3)" --stills 36 --studio 1 --seed 24 --ref-spp 96
+    render b5 "$(set_of b4)" --rooms 204 --black 0.6 --sun 1 --seed 31 --ref-spp 96
+    clean clean-b b5
+
+    # Stage 12: the same and 506 more views.
+    render c1 "$(set_of b5)" --rooms 200 --stills 130 --black 0.5 --sun 1 --seed 51 --ref-spp 96
+    clean clean-c c1
+}
+
+# A trial runs in a directory in which every data set is data/sample.
+if [ -n "$steps" ]; then
+    rm -rf runs/bundled-try
+    mkdir -p runs/bundled-try/data/bundled
+    cd runs/bundled-try
+    for name in clean-a clean-b clean-c; do
+        ln -s "$repository/data/sample" "data/bundled/$name"
+    done
+else
+    render_all
+fi
+
+for config in "$repository"/configs/bundled/*.toml; do
+    run=runs/bundled/$(basename "$config" .toml)
+    # The scores of the test split are the last file that a run writes.
+    [ -e "$run/test.json" ] && continue
+    echo "== $run"
+    set -- --config "$config"
+    [ -z "$steps" ] || set -- "$@" --set "train.steps=$steps"
+    [ ! -e "$run" ] || set -- "$@" --resume
+    demc-train "$@"
+done
+
+demc-infer export --model runs/bundled/12 --precision f16 -o runs/bundled/demc.safetensors

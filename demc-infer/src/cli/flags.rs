@@ -1,0 +1,109 @@
+//! Flags that several commands share: model, device, test-time augmentation, tiles.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use demc_infer::compute::ComputeFlags;
+use demc_infer::tiles::EXACT_HALO;
+use demc_infer::{Bundle, BundleError, BundleFile, Ensemble, Tiles, Tiling, device};
+
+use super::UsageError;
+
+/// The bundled model, described in `models/README.md`.
+const BUNDLED_MODEL: &[u8] = include_bytes!("../../../models/demc.safetensors");
+/// Its name in messages and in `inspect`.
+const BUNDLED_MODEL_NAME: &str = "the bundled model";
+
+/// `--model`.
+#[derive(Args)]
+pub struct ModelFlag {
+    /// Run directory, checkpoint directory or exported file [default: the bundled model]
+    #[arg(long = "model", value_name = "MODEL")]
+    path: Option<PathBuf>,
+}
+
+impl ModelFlag {
+    /// The model's name, for a title.
+    pub fn name(&self) -> String {
+        match &self.path {
+            Some(path) => path.display().to_string(),
+            None => BUNDLED_MODEL_NAME.into(),
+        }
+    }
+
+    /// Reads the given file or the bundled model.
+    pub fn read(&self) -> Result<BundleFile, BundleError> {
+        match &self.path {
+            Some(path) => BundleFile::read(path),
+            None => BundleFile::parse(BUNDLED_MODEL_NAME.into(), BUNDLED_MODEL),
+        }
+    }
+
+    pub fn load_onto(&self, device: &DeviceFlag) -> anyhow::Result<Bundle> {
+        let usage = |error: &dyn std::error::Error| UsageError(error.to_string());
+        device.compute.apply().map_err(|error| usage(&error))?;
+        let device = device::parse(&device.name).map_err(|error| usage(&error))?;
+        Ok(self.read()?.into_bundle(&device)?)
+    }
+}
+
+/// `--device`, `--ops`, `--isa`.
+#[derive(Args)]
+pub struct DeviceFlag {
+    /// Device: flex (CPU, in every build), or ndarray, wgpu[:N], cuda[:N] in builds with that
+    /// feature
+    #[arg(long = "device", value_name = "DEVICE", default_value = "flex")]
+    name: String,
+    #[command(flatten)]
+    compute: ComputeFlags,
+}
+
+/// `--ensemble`.
+#[derive(Args)]
+pub struct EnsembleFlag {
+    /// Test-time augmentation: mean of 1, 4 or 8 passes over flipped (4) and also transposed (8)
+    /// copies of the image. Slightly better, and 4 or 8 times slower
+    #[arg(long = "ensemble", value_name = "PASSES", default_value = "1")]
+    pub passes: Ensemble,
+}
+
+/// `--halo`, `--tile`, `--memory`.
+#[derive(Args)]
+pub struct TilingFlags {
+    /// Context around each tile, rounded up to a multiple of 32. 192 gives the same result as the
+    /// whole image. Less is faster and approximate; the error at seams is measured and printed
+    #[arg(long, value_name = "PX", default_value_t = EXACT_HALO)]
+    halo: usize,
+    /// Longest side of a tile without its halo [default: as memory allows]
+    #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(32..))]
+    tile: Option<u32>,
+    /// Memory for a pass, in addition to the network and the images [default: the available memory]
+    #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u64).range(1..1 << 32))]
+    memory: Option<u64>,
+}
+
+impl TilingFlags {
+    pub fn tiling(&self) -> Tiling {
+        Tiling {
+            halo: self.halo,
+            side: self.tile.map(|side| side as usize),
+            memory: self.memory.map(|mib| mib << 20),
+        }
+    }
+}
+
+/// Describes tiles as `3 x 2 tiles of at most 1280x960 pixels with halo 192, 1.41 times the image's
+/// pixels`, or as `whole` for one tile.
+pub fn describe(tiles: &Tiles, tiling: &Tiling) -> String {
+    if tiles.count() == 1 {
+        return "whole".into();
+    }
+    let (height, width) = tiles.largest();
+    let (rows, columns) = (tiles.rows.len(), tiles.columns.len());
+    let pixels = tiles.computed_pixels() as f64 / tiles.image_pixels() as f64;
+    let halo = tiling.halo;
+    format!(
+        "{columns} x {rows} tiles of at most {width}x{height} pixels with halo {halo}, \
+         {pixels:.2} times the image's pixels"
+    )
+}

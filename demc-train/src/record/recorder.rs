@@ -1,0 +1,138 @@
+//! Writes the metrics of a run to `metrics.jsonl`, TensorBoard and the terminal.
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use demc_infer::picture::Picture;
+
+use crate::config::Config;
+use crate::record::metrics_log::{MetricsLine, MetricsLog};
+use crate::record::progress::StepProgress;
+use crate::record::tensorboard::EventFile;
+use crate::run::run_dir::RunDir;
+use crate::run::validation::write_strip;
+
+/// Directory of the TensorBoard events in a run directory.
+const TENSORBOARD: &str = "tensorboard";
+
+/// The records of one session.
+pub struct Recorder {
+    run: PathBuf,
+    metrics: MetricsLog,
+    events: EventFile,
+    progress: StepProgress,
+    pace: Pace,
+}
+
+impl Recorder {
+    /// Opens the records of `dir` for the steps after `step`.
+    ///
+    /// # Errors
+    /// A file that cannot be read or written.
+    pub fn open(dir: &RunDir, config: &Config, step: u64, patches: usize) -> anyhow::Result<Self> {
+        let metrics = dir.metrics(step)?;
+        let mut events = EventFile::open(&dir.path().join(TENSORBOARD), step)?;
+        if step == 0 {
+            let text = format!("```toml\n{}```", config.to_toml());
+            events.text(0, "config", &text)?;
+        }
+        let progress =
+            StepProgress::new(step, config.train.steps, config.patches_per_step(), patches);
+        if metrics.was_lost() {
+            progress.line(format!(
+                "note: {} was missing: it starts after step {step}",
+                metrics.path().display()
+            ));
+        }
+        let per_step = config.patches_per_step();
+        Ok(Recorder {
+            run: dir.path().into(),
+            metrics,
+            events,
+            progress,
+            pace: Pace::new(per_step),
+        })
+    }
+
+    /// Records a step and its duration.
+    pub fn step(&mut self, step: u64, loss: f64, time: Duration) {
+        self.pace.step(time);
+        self.progress.step(step, loss);
+    }
+
+    /// Writes a line of the log, with patches per second since the previous line, and `text` to the
+    /// terminal.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn line(&mut self, mut line: MetricsLine, text: &str) -> anyhow::Result<()> {
+        line.patches_per_s = self.pace.take();
+        self.metrics.append(&line)?;
+        self.events.scalars(line.step, &line.scalars())?;
+        self.progress.line(text);
+        Ok(())
+    }
+
+    /// Writes the picture of a validation.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn picture(&mut self, step: u64, picture: &Picture) -> anyhow::Result<()> {
+        write_strip(&self.run, &format!("step-{step:08}.png"), picture)?;
+        let (width, height) = picture.size();
+        let tag = "validation/noisy, detail map, denoised, reference";
+        self.events
+            .image(step, tag, width, height, &picture.to_png()?)
+    }
+
+    /// Prints a line on the terminal alone.
+    pub fn say(&self, text: &str) {
+        self.progress.line(text);
+    }
+
+    /// Removes the progress bar.
+    pub fn finish(&self) {
+        self.progress.finish();
+    }
+}
+
+/// Patches per second of the steps, without validations and checkpoints.
+struct Pace {
+    patches_per_step: u64,
+    steps: u64,
+    time: Duration,
+}
+
+impl Pace {
+    fn new(patches_per_step: u64) -> Self {
+        Pace {
+            patches_per_step,
+            steps: 0,
+            time: Duration::ZERO,
+        }
+    }
+
+    fn step(&mut self, time: Duration) {
+        self.steps += 1;
+        self.time += time;
+    }
+
+    /// Patches per second since the last call; 0 without a step.
+    fn take(&mut self) -> f64 {
+        let patches = (self.steps * self.patches_per_step) as f64;
+        let seconds = self.time.as_secs_f64();
+        (self.steps, self.time) = (0, Duration::ZERO);
+        if seconds > 0.0 {
+            patches / seconds
+        } else {
+            0.0
+        }
+    }
+}
+
+/// The result of `work` and its duration.
+pub fn timed<T>(work: impl FnOnce() -> T) -> (T, Duration) {
+    let started = Instant::now();
+    let result = work();
+    (result, started.elapsed())
+}

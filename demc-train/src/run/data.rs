@@ -1,0 +1,119 @@
+//! The data of a run: the scenes of each split, and the statistics of the training scenes.
+
+use anyhow::Context;
+use demc_data::{
+    ChannelLayout, DataConfig, Dataset, Normalizer, PatchSource, Ranges, Scene, Split, Statistics,
+    read_frame,
+};
+use demc_infer::bundle::BundleMeta;
+use demc_model::ModelConfig;
+
+use crate::config::Config;
+
+/// The scenes and statistics of a run.
+#[derive(Debug)]
+pub struct RunData {
+    /// Channels of the files.
+    pub layout: ChannelLayout,
+    /// Training scenes.
+    pub train: Vec<Scene>,
+    /// Scenes of the training split that are held out by base scene; may be empty.
+    pub validation: Vec<Scene>,
+    /// The test split; may be empty.
+    pub test: Vec<Scene>,
+    /// Gamma, and the statistics of [`Self::train`].
+    pub normalizer: Normalizer,
+    /// Ranges of [`Self::train`], and of the scenes that initial weights were trained on.
+    pub ranges: Ranges,
+    /// Number of negative values of colour and reference, which are clamped to 0.
+    pub clamped: u64,
+}
+
+impl RunData {
+    /// Opens the data set and reads every scene once, so that an invalid one is found before the
+    /// first step. The seed draws the validation scenes.
+    ///
+    /// # Errors
+    /// An invalid layout, manifest or image; a training split without scenes.
+    pub fn open(config: &Config) -> anyhow::Result<Self> {
+        let DataConfig {
+            root,
+            layout,
+            validation,
+            patch_size,
+            stride,
+            border,
+            ..
+        } = &config.data;
+        let layout = ChannelLayout::resolve(layout)?;
+        let dataset = Dataset::open(root, &layout)?;
+        let (train, validation) = dataset.train_validation(*validation, config.train.seed)?;
+        let test = dataset.scenes.iter();
+        let test: Vec<Scene> = test
+            .filter(|scene| scene.split == Split::Test)
+            .cloned()
+            .collect();
+        let all: Vec<Scene> = train.iter().chain(&validation).cloned().collect();
+        // Validation scenes too: another seed may train on them.
+        demc_data::patch::patches(&all, *patch_size, *stride, *border)?;
+        let statistics = Statistics::measure(
+            &train,
+            &layout,
+            config.data.gamma,
+            config.data.albedo_demodulation_epsilon,
+            config.loss.relmse_epsilon,
+        )
+        .context("measuring the training scenes")?;
+        let mut clamped = statistics.clamped;
+        for scene in validation.iter().chain(&test) {
+            // Now, not after days of training.
+            clamped += read_frame(&scene.path, &layout)?.clamped as u64;
+        }
+        Ok(RunData {
+            layout,
+            train,
+            validation,
+            test,
+            normalizer: statistics.normalizer,
+            ranges: match config.data.augment.axes {
+                true => statistics.ranges.in_any_axes(),
+                false => statistics.ranges,
+            },
+            clamped,
+        })
+    }
+
+    /// The source of the training patches.
+    ///
+    /// # Errors
+    /// Scenes smaller than a patch.
+    pub fn patch_source(&self, config: &Config) -> Result<PatchSource, demc_data::Error> {
+        PatchSource::new(
+            &config.data,
+            self.train.clone(),
+            self.layout.clone(),
+            self.normalizer.clone(),
+            config.train.seed,
+        )
+    }
+
+    /// The description of weights that are trained on this data, at `step`.
+    pub fn meta(&self, model: ModelConfig, step: u64) -> BundleMeta {
+        BundleMeta::new(model, self.normalizer.clone(), self.layout.clone(), step)
+            .with_ranges(self.ranges.clone())
+    }
+
+    /// `10 training scenes, 2 validation scenes, 4 test scenes`
+    pub fn summary(&self) -> String {
+        let counts = [
+            (&self.train, "training"),
+            (&self.validation, "validation"),
+            (&self.test, "test"),
+        ];
+        let counts = counts.map(|(scenes, split)| {
+            let plural = if scenes.len() == 1 { "" } else { "s" };
+            format!("{} {split} scene{plural}", scenes.len())
+        });
+        counts.join(", ")
+    }
+}

@@ -1,0 +1,131 @@
+//! The network before its first step: random, or the weights of `train.init`.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, ensure};
+use burn::tensor::Device;
+use demc_data::ranges::Ranges;
+use demc_infer::bundle::BundleFile;
+use demc_model::{Denoiser, ModelConfig};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use crate::config::Config;
+use crate::run::checkpoint::store::sha256_of;
+
+/// A network before its first step.
+pub struct InitialNetwork {
+    /// The network.
+    pub model: Denoiser,
+    /// The source of its weights; `None` after random initialisation.
+    pub weights: Option<InitialWeights>,
+}
+
+/// The weights of `train.init`, for `run.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct InitialWeights {
+    /// The file that `train.init` names or contains.
+    pub file: PathBuf,
+    /// Its checksum.
+    pub sha256: String,
+    /// The step of the run that wrote it.
+    pub step: u64,
+    /// The `data.albedo_demodulation_epsilon` of that run.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub albedo_demodulation_epsilon: Option<f32>,
+    /// The ranges of the scenes of that run, if the file contains them.
+    #[serde(skip)]
+    pub ranges: Option<Ranges>,
+}
+
+impl InitialWeights {
+    /// A note for the user on these weights in a run of `config`.
+    pub fn note(&self, config: &Config) -> String {
+        let InitialWeights { file, step, .. } = self;
+        let note = format!("train.init: {}, step {step}", file.display());
+        let shown = |epsilon: Option<f32>| epsilon.map_or("absent".into(), |e| e.to_string());
+        let [before, now] = [
+            self.albedo_demodulation_epsilon,
+            config.data.albedo_demodulation_epsilon,
+        ];
+        match before == now {
+            true => note,
+            false => format!(
+                "{note}; data.albedo_demodulation_epsilon: {} instead of {}, so the network adapts to a \
+                 different input colour first",
+                shown(now),
+                shown(before)
+            ),
+        }
+    }
+}
+
+/// The network of `train.init`, or a random one from the seed.
+///
+/// Features are normalised by the statistics of this run's scenes, not by those of the initial
+/// weights.
+///
+/// # Errors
+/// Those of [`read_init`]; a file whose weights do not fit its network.
+pub fn initial_network(
+    config: &Config,
+    flat_color: [f32; 3],
+    device: &Device,
+) -> anyhow::Result<InitialNetwork> {
+    let Some(file) = read_init(config)? else {
+        return Ok(InitialNetwork {
+            model: random_network(&config.model, config.train.seed, flat_color, device),
+            weights: None,
+        });
+    };
+    let weights = InitialWeights {
+        file: file.path.clone(),
+        sha256: sha256_of(&file.path)?,
+        step: file.meta.step,
+        albedo_demodulation_epsilon: file.meta.normalizer.albedo_demodulation_epsilon,
+        ranges: file.meta.ranges.clone(),
+    };
+    Ok(InitialNetwork {
+        model: file.into_bundle(device).context("train.init")?.model,
+        weights: Some(weights),
+    })
+}
+
+/// The file of `train.init`, if it is set.
+///
+/// # Errors
+/// A file without a network; a network that differs from `[model]` or `data.gamma`, with each
+/// differing key.
+pub fn read_init(config: &Config) -> anyhow::Result<Option<BundleFile>> {
+    let Some(init) = &config.train.init else {
+        return Ok(None);
+    };
+    let file = BundleFile::read(init).context("train.init")?;
+    let mut saved = config.clone();
+    // Its own initialisation does not matter.
+    saved.model = ModelConfig {
+        head: config.model.head,
+        detail: config.model.detail,
+        ..file.meta.model
+    };
+    saved.data.gamma = file.meta.normalizer.gamma;
+    let differences = config.differences(&saved);
+    ensure!(
+        differences.is_empty(),
+        "train.init: {}: weights of another network: {}",
+        init.display(),
+        differences.join("; ")
+    );
+    Ok(Some(file))
+}
+
+/// A network with random weights from a seed; a grey head starts at the best flat image.
+pub fn random_network(
+    model: &ModelConfig,
+    seed: u64,
+    flat_color: [f32; 3],
+    device: &Device,
+) -> Denoiser {
+    model.init(&mut ChaCha8Rng::seed_from_u64(seed), flat_color, device)
+}

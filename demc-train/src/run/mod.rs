@@ -1,0 +1,11 @@
+//! A training run and its directory: session, loop, checkpoints, signals, validation, warnings.
+
+pub mod checkpoint;
+pub mod data;
+pub mod initial;
+pub mod run_dir;
+pub mod session;
+pub mod signals;
+pub mod training;
+pub mod validation;
+pub mod warnings;

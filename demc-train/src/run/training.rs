@@ -1,0 +1,433 @@
+//! The training loop.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail, ensure};
+use burn::module::Module;
+use burn::tensor::Device;
+use demc_data::{BatchLoader, PatchSource};
+use demc_infer::bundle::locate::BEST;
+use demc_infer::bundle::{Bundle, Names, Precision};
+use demc_infer::evaluate::Report;
+use demc_model::Denoiser;
+
+use crate::config::{Config, OnNan};
+use crate::record::metrics_log::MetricsLine;
+use crate::record::recorder::{Recorder, timed};
+use crate::run::checkpoint::store::{CheckpointRetention, CheckpointStore};
+use crate::run::checkpoint::{self, BestValidation, Checkpoint, LoopState, MetricSums};
+use crate::run::data::RunData;
+use crate::run::initial::{InitialNetwork, InitialWeights, initial_network};
+use crate::run::run_dir::{RunDir, RunFacts};
+use crate::run::signals::Signals;
+use crate::run::validation::{self, Validation};
+use crate::run::warnings::LoopFacts;
+use crate::step::optimizer::{DormantChannels, Optimizer};
+use crate::step::trainer::{StepReport, Trainer};
+
+/// Consecutive skipped steps after which a run fails despite `train.on_nan = "skip"`; ours.
+const MAX_SKIPPED: u64 = 100;
+
+/// A run that can train.
+pub struct TrainingRun {
+    config: Config,
+    data: RunData,
+    dir: RunDir,
+    source: Arc<PatchSource>,
+    trainer: Trainer,
+    state: LoopState,
+    /// The weights of `train.init`, if the run is new.
+    initial: Option<InitialWeights>,
+    /// Steps skipped since the last one that was taken.
+    skipped_in_a_row: u64,
+}
+
+/// How the training loop ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LoopEnd {
+    /// After its last step.
+    Done,
+    /// On a signal, after a checkpoint of this step.
+    Stopped {
+        /// The signal.
+        signal: i32,
+        /// The step.
+        step: u64,
+    },
+}
+
+impl TrainingRun {
+    /// A new run, or the run of `checkpoint` at its step. `device` has no autodiff.
+    ///
+    /// # Errors
+    /// Scenes smaller than a patch; a checkpoint of another run; a `train.init` of another network.
+    pub fn new(
+        config: Config,
+        mut data: RunData,
+        dir: RunDir,
+        checkpoint: Option<Checkpoint>,
+        device: &Device,
+    ) -> anyhow::Result<Self> {
+        let device = device.clone().autodiff();
+        let source = data.patch_source(&config)?;
+        let (model, average, optimizer, state, initial) = match checkpoint {
+            Some(Checkpoint {
+                bundle,
+                average,
+                optimizer,
+                state,
+            }) => {
+                if let Some(ranges) = &bundle.meta.ranges {
+                    data.ranges = ranges.clone();
+                }
+                let expected = data.meta(config.model, state.step);
+                ensure!(
+                    bundle.meta == expected,
+                    "{}: network, layout or statistics of the checkpoint differ from this run's",
+                    dir.path().display()
+                );
+                ensure!(
+                    average.is_some() == config.train.ema_decay.is_some(),
+                    "{}: either the checkpoint or train.ema_decay has no weight average",
+                    dir.path().display()
+                );
+                (bundle.model, average, optimizer, state, None)
+            }
+            None => {
+                let InitialNetwork { model, weights } =
+                    initial_network(&config, data.normalizer.flat_color, &device)?;
+                let before = weights.as_ref().and_then(|weights| weights.ranges.as_ref());
+                if let Some(before) = before {
+                    data.ranges = data.ranges.with(before);
+                }
+                (
+                    model,
+                    None,
+                    Optimizer::new(&config),
+                    LoopState::start(),
+                    weights,
+                )
+            }
+        };
+        let trainer = Trainer::new(&config, model, optimizer, average, device);
+        Ok(TrainingRun {
+            config,
+            data,
+            dir,
+            source: Arc::new(source),
+            trainer,
+            state,
+            initial,
+            skipped_in_a_row: 0,
+        })
+    }
+
+    /// The configuration.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// The weights of `train.init`, if the run is new.
+    pub fn initial(&self) -> Option<&InitialWeights> {
+        self.initial.as_ref()
+    }
+
+    /// Patches per epoch.
+    pub fn patches(&self) -> usize {
+        self.source.patches().len()
+    }
+
+    /// Number of trainable parameters.
+    pub fn parameters(&self) -> u64 {
+        self.config.model.parameter_count()
+    }
+
+    /// Trains to the last step or the first signal. `device` is the name of the device for the
+    /// record.
+    ///
+    /// # Errors
+    /// A scene that cannot be read; a file that cannot be written; a non-finite loss.
+    pub fn train(&mut self, device: &str) -> anyhow::Result<LoopEnd> {
+        let mut recorder = self.open_records(device)?;
+        let (train, run) = (self.config.train.clone(), self.config.run.clone());
+        let rate = self.config.learning_rate();
+        let scenes = self.data.train.iter();
+        let scenes: Vec<String> = scenes.map(|scene| scene.name.clone()).collect();
+        let first_batch = self.state.step * train.grad_accumulation as u64;
+        let mut loader = BatchLoader::new(self.source.clone(), first_batch);
+        let signals = Signals::listen()?;
+        let mut clock = SessionClock::new(self.state.elapsed_s, run.checkpoint_interval());
+        while self.state.step < train.steps {
+            let lr = rate.at(self.state.step);
+            let (report, time) = timed(|| self.trainer.step(lr, || loader.next()));
+            let report = report?;
+            let mut warnings = self.count(&report, lr, &scenes)?;
+            let step = self.state.step;
+            recorder.step(step, report.loss, time);
+            self.state.elapsed_s = clock.elapsed();
+            let due = |every: u64| step.is_multiple_of(every) || step == train.steps;
+            let mut validation = None;
+            if due(run.validate_every) {
+                validation = self.validate(&mut recorder)?;
+            }
+            if let Some(validation) = &validation {
+                warnings.extend(self.state.watch.validation(&validation.health));
+            }
+            if due(run.log_every) || validation.is_some() {
+                let line = self.metrics_line(lr, validation.as_ref());
+                let watch = &mut self.state.watch;
+                warnings.extend(line.dormant.and_then(|share| watch.dormant(share)));
+                recorder.line(line, &self.describe(&line))?;
+                self.state.since_log = MetricSums::default();
+            }
+            for warning in warnings {
+                recorder.say(&format!("warning: step {step}: {warning}"));
+            }
+            let signal = signals.received();
+            if due(run.checkpoint_every) || clock.checkpoint_is_due() || signal.is_some() {
+                self.save()?;
+                clock.checkpoint_saved();
+            }
+            if let Some(signal) = signal.filter(|_| step < train.steps) {
+                recorder.finish();
+                return Ok(LoopEnd::Stopped { signal, step });
+            }
+        }
+        recorder.finish();
+        Ok(LoopEnd::Done)
+    }
+
+    /// Opens the run directory and the records in it.
+    fn open_records(&mut self, device: &str) -> anyhow::Result<Recorder> {
+        let facts = RunFacts {
+            device,
+            operations: &self.trainer.operations(),
+            parameters: self.parameters(),
+            patches: self.patches(),
+            initial: self.initial.as_ref(),
+        };
+        let note = self.dir.open(&self.config, &self.data, facts)?;
+        let recorder = Recorder::open(&self.dir, &self.config, self.state.step, self.patches())?;
+        if let Some(note) = note {
+            recorder.say(&format!("note: {note}"));
+        }
+        Ok(recorder)
+    }
+
+    /// Adds a step to the state; returns its warnings.
+    fn count(
+        &mut self,
+        report: &StepReport,
+        lr: f64,
+        scenes: &[String],
+    ) -> anyhow::Result<Vec<String>> {
+        self.state.step += 1;
+        if !report.is_finite() {
+            self.skipped_in_a_row += 1;
+            let skip = self.config.train.on_nan == OnNan::Skip;
+            if !skip || self.skipped_in_a_row >= MAX_SKIPPED {
+                bail!(self.non_finite(report, lr));
+            }
+            self.state.skipped += 1;
+            let patches = report.describe_patches(self.source.scenes());
+            return Ok(vec![format!(
+                "non-finite loss or gradient, skipped: {patches}"
+            )]);
+        }
+        self.skipped_in_a_row = 0;
+        let sums = &mut self.state.since_log;
+        sums.steps += 1;
+        sums.loss += report.loss;
+        sums.grad_norm += report.grad_norm;
+        let facts = LoopFacts {
+            steps: self.config.train.steps,
+            patches: self.source.patches().len() as u64,
+            scenes,
+        };
+        let patches = report.patches.iter();
+        let patches = patches.map(|(patch, loss)| (patch.scene as usize, *loss));
+        Ok(self.state.watch.step(facts, report.loss, patches))
+    }
+
+    /// The error of a non-finite step, with everything that helps to find its cause.
+    fn non_finite(&self, report: &StepReport, lr: f64) -> String {
+        let search = CheckpointStore::new(self.dir.path()).newest_intact();
+        let checkpoint = match search.ok().and_then(|search| search.intact) {
+            Some(dir) => format!("the last intact checkpoint is {}", dir.display()),
+            None => "there is no checkpoint yet".into(),
+        };
+        let row = match self.skipped_in_a_row {
+            1 => String::new(),
+            count => format!(" in {count} consecutive steps"),
+        };
+        format!(
+            "step {}: non-finite loss or gradient{row}: loss {}, gradient norm {}, learning rate {lr:.3e}; \
+             patches: {}; {checkpoint}; a smaller optimizer.lr_start or optimizer.max_grad_norm may help, \
+             --set train.on_nan=skip skips such steps",
+            self.state.step,
+            report.loss,
+            report.grad_norm,
+            report.describe_patches(self.source.scenes())
+        )
+    }
+
+    /// Writes a checkpoint.
+    fn save(&self) -> anyhow::Result<()> {
+        let bundle = self.bundle(self.trainer.model().valid());
+        let average = self.trainer.average();
+        let average = average.cloned().map(|model| self.bundle(model));
+        let retention = CheckpointRetention {
+            newest: self.config.run.keep,
+            every: self.config.run.keep_every,
+        };
+        checkpoint::save(
+            self.dir.path(),
+            &bundle,
+            average.as_ref(),
+            self.trainer.optimizer(),
+            &self.state,
+            retention,
+        )
+    }
+
+    /// Scores and draws the validation scenes, and keeps the weights if they are the best so far.
+    fn validate(&mut self, recorder: &mut Recorder) -> anyhow::Result<Option<Validation>> {
+        if self.data.validation.is_empty() {
+            return Ok(None);
+        }
+        let bundle = self.bundle(self.trainer.result());
+        let found = validation::score(&bundle, &self.data.validation, validation::STRIP_SCENES)
+            .context("validation")?;
+        let step = self.state.step;
+        if let Some(picture) = &found.picture {
+            recorder.picture(step, picture)?;
+        }
+        let relmse = found.report.mean.denoised.relmse;
+        if self.state.best.is_none_or(|best| relmse < best.relmse) {
+            bundle.save(&self.best_path(), Names::Burn, Precision::F32)?;
+            self.state.best = Some(BestValidation { step, relmse });
+        }
+        Ok(Some(found))
+    }
+
+    fn best_path(&self) -> PathBuf {
+        self.dir.path().join(BEST)
+    }
+
+    /// One sentence on which weights the run keeps, and why.
+    pub fn kept_weights(&self) -> String {
+        let steps = self.config.train.steps;
+        match self.state.best {
+            Some(BestValidation { step, relmse }) => format!(
+                "kept weights: those of step {step} of {steps}, with the best validation RelMSE {relmse:.4}"
+            ),
+            None => format!("kept weights: those of the last step {steps}, no scene is held out"),
+        }
+    }
+
+    fn metrics_line(&self, lr: f64, validation: Option<&Validation>) -> MetricsLine {
+        let MetricSums {
+            steps,
+            loss,
+            grad_norm,
+        } = self.state.since_log;
+        let denoised = validation.map(|found| &found.report.mean.denoised);
+        let health = validation.map(|found| found.health);
+        MetricsLine {
+            step: self.state.step,
+            epoch: (self.state.step * self.config.patches_per_step()) as f64
+                / self.patches() as f64,
+            loss: loss / steps as f64,
+            lr,
+            grad_norm: grad_norm / steps as f64,
+            valid_relmse: denoised.map(|score| score.relmse),
+            valid_ssim: denoised.and_then(|score| score.ssim),
+            dead_channels: health.and_then(|health| health.dead_channels),
+            zero_share: health.map(|health| health.zero_share),
+            dormant: self.trainer.dormant().map(DormantChannels::share),
+            skipped: self.state.skipped,
+            patches_per_s: 0.0,
+            elapsed_s: self.state.elapsed_s,
+        }
+    }
+
+    /// The line of the terminal for a line of the log.
+    fn describe(&self, line: &MetricsLine) -> String {
+        let MetricsLine { step, loss, lr, .. } = line;
+        let mut text = format!("step {step:>6}  loss {loss:.4}  lr {lr:.2e}");
+        if let (Some(relmse), Some(ssim)) = (line.valid_relmse, line.valid_ssim) {
+            text += &format!("  validation RelMSE {relmse:.4}  SSIM {ssim:.4}");
+        }
+        if self.state.best.is_some_and(|best| best.step == *step) {
+            text += "  best";
+        }
+        text
+    }
+
+    /// A network of this run at its present step, with statistics and layout.
+    fn bundle(&self, model: Denoiser) -> Bundle {
+        let meta = self.data.meta(self.config.model, self.state.step);
+        Bundle { meta, model }
+    }
+
+    /// Scores the test split with the kept weights; `None` without test scenes. Writes `test.json`
+    /// and `strips/test.png`.
+    ///
+    /// # Errors
+    /// A scene that cannot be read; a file that cannot be written.
+    pub fn test(&self, device: &Device) -> anyhow::Result<Option<(u64, Report)>> {
+        if self.data.test.is_empty() {
+            return Ok(None);
+        }
+        let bundle = match self.state.best {
+            Some(_) => Bundle::load(&self.best_path(), device)?,
+            None => self.bundle(self.trainer.result()),
+        };
+        let Validation {
+            report, picture, ..
+        } = validation::score(&bundle, &self.data.test, usize::MAX).context("test")?;
+        if let Some(picture) = picture {
+            validation::write_strip(self.dir.path(), "test.png", &picture)?;
+        }
+        self.dir
+            .write("test.json", &serde_json::to_vec_pretty(&report)?)?;
+        Ok(Some((bundle.meta.step, report)))
+    }
+}
+
+/// The duration of a run over its sessions, and the time since the last checkpoint.
+struct SessionClock {
+    started: Instant,
+    /// Seconds of earlier sessions.
+    before: f64,
+    saved: Instant,
+    interval: Duration,
+}
+
+impl SessionClock {
+    fn new(before: f64, interval: Duration) -> Self {
+        let now = Instant::now();
+        SessionClock {
+            started: now,
+            before,
+            saved: now,
+            interval,
+        }
+    }
+
+    /// Seconds of the run so far.
+    fn elapsed(&self) -> f64 {
+        self.before + self.started.elapsed().as_secs_f64()
+    }
+
+    fn checkpoint_saved(&mut self) {
+        self.saved = Instant::now();
+    }
+
+    /// Whether `run.checkpoint_minutes` have passed.
+    fn checkpoint_is_due(&self) -> bool {
+        self.saved.elapsed() >= self.interval
+    }
+}

@@ -1,0 +1,326 @@
+//! Adam (Kingma and Ba 2014), or Muon (Jordan et al. 2024) for kernels, and the norm and clipping
+//! of a gradient.
+//!
+//! [`demc_model::ops::update`] and [`demc_model::ops::muon`] compute a step. The state is kept here,
+//! by the names of the weights: Burn's whole-module optimizer restores state on a default device,
+//! which may not exist on this machine.
+
+use std::collections::BTreeMap;
+
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::optim::GradientsParams;
+use burn::tensor::{Device, Tensor, TensorData};
+use demc_model::ops::muon;
+use demc_model::ops::update::{AdamConstants, AdamMoments, sum_of_squares};
+
+use demc_model::{Denoiser, Ops, Role, Stage, Weight, WeightSpec};
+
+use crate::config::Config;
+
+/// Decay of the first moment (Kingma and Ba's default; the paper names no other).
+const BETA_1: f32 = 0.9;
+/// Decay of the second moment (Kingma and Ba's default).
+const BETA_2: f32 = 0.999;
+/// Steps without a gradient after which a channel is dormant.
+pub const DORMANT_STEPS: u64 = 175;
+/// A channel is dormant if its bias's first moment is at most this share of the root of the second.
+/// Ours: without a gradient that takes 175 steps; with a gradient, however small, it never happens.
+const DORMANT_SHARE: f32 = 1e-8;
+/// Suffix of the first moment's name in a checkpoint.
+const FIRST: &str = ".m";
+/// Suffix of the second moment's name.
+const SECOND: &str = ".v";
+/// Suffix of the name of Muon's sum of gradients.
+const VELOCITY: &str = ".velocity";
+
+/// Adam for a network's trainable weights, or Muon for its kernels up to `optimizer.muon_max_rows`
+/// rows.
+pub struct Optimizer {
+    constants: AdamConstants,
+    /// Rows up to which Muon updates a kernel; `None` with Adam alone.
+    muon_rows: Option<usize>,
+    steps: u64,
+    /// Every weight of the network, in module order.
+    specs: Vec<WeightSpec>,
+    states: BTreeMap<String, WeightState>,
+}
+
+/// The state of one weight, flattened.
+#[allow(
+    clippy::large_enum_variant,
+    reason = "handles of tensors, a hundred of them"
+)]
+enum WeightState {
+    Adam(AdamMoments),
+    Muon(Tensor<1>),
+}
+
+impl WeightState {
+    /// The tensors with the suffixes of their names in a checkpoint.
+    fn tensors(&self) -> Vec<(&'static str, &Tensor<1>)> {
+        match self {
+            WeightState::Adam(AdamMoments { first, second }) => {
+                vec![(FIRST, first), (SECOND, second)]
+            }
+            WeightState::Muon(velocity) => vec![(VELOCITY, velocity)],
+        }
+    }
+}
+
+/// The number of dormant channels of a network: channels without a gradient for 175 steps, or ever.
+///
+/// A channel that is zero behind its ReLU at every pixel has no gradient, so no step revives it
+/// (Sokar et al. 2023, "The Dormant Neuron Phenomenon").
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct DormantChannels {
+    /// Dormant channels.
+    pub dormant: usize,
+    /// All channels except those of the head, which are the image.
+    pub channels: usize,
+}
+
+impl DormantChannels {
+    /// Share of dormant channels, 0 to 1.
+    pub fn share(self) -> f64 {
+        self.dormant as f64 / self.channels.max(1) as f64
+    }
+}
+
+impl Optimizer {
+    /// An optimizer before its first step.
+    pub fn new(config: &Config) -> Self {
+        let constants = AdamConstants {
+            beta_1: BETA_1,
+            beta_2: BETA_2,
+            epsilon: config.optimizer.adam_epsilon,
+        };
+        Optimizer {
+            constants,
+            muon_rows: config.optimizer.muon_rows(),
+            steps: 0,
+            specs: config.model.weight_specs(),
+            states: BTreeMap::new(),
+        }
+    }
+
+    /// Steps taken so far, without skipped ones.
+    pub fn steps(&self) -> u64 {
+        self.steps
+    }
+
+    /// Every weight of the network, in module order.
+    pub fn specs(&self) -> &[WeightSpec] {
+        &self.specs
+    }
+
+    /// Takes one step along `grads`; returns the updated network.
+    pub fn step(&mut self, lr: f64, model: Denoiser, grads: GradientsParams) -> Denoiser {
+        let specs = std::mem::take(&mut self.specs);
+        let mut step = OptimizerStep {
+            ops: model.ops(),
+            optimizer: self,
+            lr,
+            grads,
+            specs: specs.iter(),
+        };
+        let model = model.map(&mut step);
+        self.specs = specs;
+        self.steps += 1;
+        model
+    }
+
+    /// Counts the dormant channels, from Adam's moments of the biases.
+    pub fn dormant(&self) -> DormantChannels {
+        let mut count = DormantChannels::default();
+        let biases = self.specs.iter();
+        for spec in biases.filter(|spec| spec.role == Role::Bias && spec.stage != Stage::Head) {
+            let Some(WeightState::Adam(moments)) = self.states.get(&spec.name) else {
+                continue;
+            };
+            for (first, second) in values(&moments.first)
+                .into_iter()
+                .zip(values(&moments.second))
+            {
+                count.channels += 1;
+                count.dormant += usize::from(first.abs() <= DORMANT_SHARE * second.sqrt());
+            }
+        }
+        count
+    }
+
+    /// The state on the host, by name: two tensors per weight of Adam, one per kernel of Muon.
+    pub fn state(&self) -> Vec<Weight> {
+        let tensors = self.states.iter().flat_map(|(name, state)| {
+            let tensors = state.tensors().into_iter();
+            tensors.map(move |(suffix, tensor)| {
+                let data = values(tensor);
+                Weight {
+                    name: format!("{name}{suffix}"),
+                    shape: vec![data.len()],
+                    data,
+                }
+            })
+        });
+        tensors.collect()
+    }
+
+    /// The optimizer with the state that [`Self::state`] returned after `steps` steps.
+    ///
+    /// # Errors
+    /// The name of a moment without its partner.
+    pub fn restore(
+        config: &Config,
+        steps: u64,
+        state: Vec<Weight>,
+        device: &Device,
+    ) -> Result<Self, String> {
+        let mut tensors: BTreeMap<String, Tensor<1>> = state
+            .into_iter()
+            .map(|weight| {
+                let data = TensorData::new(weight.data, weight.shape);
+                (weight.name, Tensor::from_data(data, device))
+            })
+            .collect();
+        let mut states = BTreeMap::new();
+        while let Some((name, tensor)) = tensors.pop_first() {
+            let (weight, state) = if let Some(weight) = name.strip_suffix(VELOCITY) {
+                (weight, WeightState::Muon(tensor))
+            } else {
+                let weight = name.strip_suffix(FIRST).ok_or_else(|| name.clone())?;
+                let second = tensors
+                    .remove(&format!("{weight}{SECOND}"))
+                    .ok_or_else(|| name.clone())?;
+                let first = tensor;
+                (weight, WeightState::Adam(AdamMoments { first, second }))
+            };
+            states.insert(weight.to_string(), state);
+        }
+        Ok(Optimizer {
+            steps,
+            states,
+            ..Optimizer::new(config)
+        })
+    }
+
+    /// Whether the state belongs to this network and optimizer: one per trainable weight, of its
+    /// size.
+    pub fn is_complete(&self) -> bool {
+        let has_state = |spec: &&WeightSpec| {
+            self.states.get(&spec.name).is_some_and(|state| {
+                matches!(state, WeightState::Muon(_)) == self.is_for_muon(spec)
+                    && state
+                        .tensors()
+                        .iter()
+                        .all(|(_, t)| t.dims() == [spec.len()])
+            })
+        };
+        let trainable: Vec<&WeightSpec> = self
+            .specs
+            .iter()
+            .filter(|s| s.role.is_trainable())
+            .collect();
+        trainable.len() == self.states.len() && trainable.iter().all(has_state)
+    }
+
+    /// Whether Muon updates this weight. The head computes the image, not features: Adam updates
+    /// it, as in Jordan et al.
+    fn is_for_muon(&self, spec: &WeightSpec) -> bool {
+        let fits = |max| spec.rows().is_some_and(|rows| rows <= max);
+        spec.stage != Stage::Head && self.muon_rows.is_some_and(fits)
+    }
+}
+
+/// A tensor on the host.
+fn values(tensor: &Tensor<1>) -> Vec<f32> {
+    let data = tensor.to_data();
+    data.try_to_vec().expect("moments are float32")
+}
+
+/// One step over all weights of a network.
+struct OptimizerStep<'a> {
+    ops: Ops,
+    optimizer: &'a mut Optimizer,
+    lr: f64,
+    grads: GradientsParams,
+    specs: std::slice::Iter<'a, WeightSpec>,
+}
+
+impl ModuleMapper for OptimizerStep<'_> {
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let spec = self.specs.next().expect("a description of every weight");
+        let (id, tensor, mapper) = param.consume();
+        let Some(grad) = self.grads.remove::<D>(id) else {
+            return Param::from_mapped_value(id, tensor, mapper);
+        };
+        assert_eq!(spec.shape, tensor.dims(), "{}", spec.name);
+        let optimizer = &mut *self.optimizer;
+        let state = optimizer.states.remove(&spec.name);
+        let (stepped, state) = if optimizer.is_for_muon(spec) {
+            let velocity = match state {
+                Some(WeightState::Muon(velocity)) => Some(velocity),
+                _ => None,
+            };
+            let (stepped, velocity) = muon::step(spec, self.lr, tensor.inner(), grad, velocity);
+            (stepped, WeightState::Muon(velocity))
+        } else {
+            let moments = match state {
+                Some(WeightState::Adam(moments)) => Some(moments),
+                _ => None,
+            };
+            let (stepped, moments) = optimizer.constants.step(
+                self.ops,
+                self.lr,
+                optimizer.steps,
+                tensor.inner(),
+                grad,
+                moments,
+            );
+            (stepped, WeightState::Adam(moments))
+        };
+        optimizer.states.insert(spec.name.clone(), state);
+        let tensor = Tensor::from_inner(stepped).require_grad();
+        Param::from_mapped_value(id, tensor, mapper)
+    }
+}
+
+/// The Euclidean norm of the whole gradient.
+pub fn grad_norm(model: &Denoiser, grads: &GradientsParams) -> f64 {
+    struct FlatGradients<'a> {
+        grads: &'a GradientsParams,
+        tensors: Vec<Tensor<1>>,
+    }
+    impl ModuleVisitor for FlatGradients<'_> {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            if let Some(grad) = self.grads.get::<D>(param.id) {
+                self.tensors.push(grad.reshape([-1]));
+            }
+        }
+    }
+    let mut flat = FlatGradients {
+        grads,
+        tensors: Vec::new(),
+    };
+    model.visit(&mut flat);
+    sum_of_squares(model.ops(), flat.tensors).sqrt()
+}
+
+/// The gradient times `factor`.
+pub fn scaled(model: &Denoiser, grads: GradientsParams, factor: f64) -> GradientsParams {
+    struct GradientScaler {
+        grads: GradientsParams,
+        factor: f64,
+    }
+    impl ModuleVisitor for GradientScaler {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            if let Some(grad) = self.grads.remove::<D>(param.id) {
+                self.grads.register(param.id, grad.mul_scalar(self.factor));
+            }
+        }
+    }
+    let mut scaler = GradientScaler { grads, factor };
+    model.visit(&mut scaler);
+    scaler.grads
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,281 @@
+//! The file of an ablation: a base configuration, seeds, and a list of variants.
+//!
+//! ```toml
+//! base = "configs/quickstart.toml"
+//! dir = "runs/ablation"
+//! seeds = [1, 2, 3]
+//! match_parameters = true
+//!
+//! [[variants]]
+//! name = "DEMC"
+//! set = ["model.variant=demc"]
+//! ```
+
+use std::path::{Path, PathBuf};
+
+use demc_model::ModelConfig;
+use serde::Deserialize;
+
+use crate::config::{Config, ConfigError, one_line};
+
+/// The TOML file.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct AblationFile {
+    /// Configuration of all variants; a relative path starts at the current directory.
+    base: PathBuf,
+    /// Directory of the runs and the results.
+    dir: PathBuf,
+    /// Edits for all variants, `table.key=value`.
+    #[serde(default)]
+    set: Vec<String>,
+    /// Seeds; each variant is trained once per seed.
+    #[serde(default = "one_seed")]
+    seeds: Vec<u64>,
+    /// Whether every other variant gets the width with the parameter count closest to the first
+    /// one's.
+    #[serde(default = "yes")]
+    match_parameters: bool,
+    /// The variants; the others are compared with the first.
+    variants: Vec<VariantEntry>,
+}
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct VariantEntry {
+    name: String,
+    #[serde(default)]
+    config: Option<PathBuf>,
+    #[serde(default)]
+    set: Vec<String>,
+}
+
+fn one_seed() -> Vec<u64> {
+    vec![1]
+}
+
+fn yes() -> bool {
+    true
+}
+
+/// A checked ablation.
+#[derive(Clone, Debug)]
+pub struct AblationSpec {
+    /// Directory of the runs and the results.
+    pub dir: PathBuf,
+    /// The seeds in training order.
+    pub seeds: Vec<u64>,
+    /// The variants, the reference first.
+    pub variants: Vec<AblationVariant>,
+}
+
+/// A variant of an ablation.
+#[derive(Clone, Debug)]
+pub struct AblationVariant {
+    /// Its name in tables.
+    pub name: String,
+    /// Its configuration; each run sets seed and directory.
+    pub config: Config,
+}
+
+impl AblationSpec {
+    /// Reads an ablation. `sets` are edits for all variants and override those of the file.
+    ///
+    /// # Errors
+    /// An invalid file or configuration; equal names or invalid directory names; no seeds or equal
+    /// seeds; fewer than two variants.
+    pub fn load(path: &Path, sets: &[String]) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read {
+            path: path.into(),
+            source,
+        })?;
+        let file: AblationFile = toml::from_str(&text).map_err(|error| {
+            let message = one_line(&error.to_string());
+            ConfigError::Source(format!("{}: {message}", path.display()))
+        })?;
+        let problems = file.problems();
+        if !problems.is_empty() {
+            return Err(ConfigError::Values {
+                path: path.into(),
+                problems,
+            });
+        }
+        let mut variants = Vec::with_capacity(file.variants.len());
+        for entry in &file.variants {
+            let config = entry.config.as_ref().unwrap_or(&file.base);
+            let sets = [&file.set[..], &entry.set, sets].concat();
+            variants.push(AblationVariant {
+                name: entry.name.clone(),
+                config: Config::load(config, &sets)?,
+            });
+        }
+        if file.match_parameters {
+            match_parameters(&mut variants);
+        }
+        Ok(AblationSpec {
+            dir: file.dir,
+            seeds: file.seeds,
+            variants,
+        })
+    }
+
+    /// The configuration of one run.
+    pub fn run(&self, variant: &AblationVariant, seed: u64) -> Config {
+        let mut config = variant.config.clone();
+        config.train.seed = seed;
+        config.run.dir = Some(self.dir.join(format!("{}-seed-{seed}", variant.name)));
+        config
+    }
+
+    /// Keys outside `[model]` in which the variants differ from the first.
+    pub fn differences(&self) -> Vec<String> {
+        let (first, others) = self.variants.split_first().expect("at least two");
+        let differing = others.iter().flat_map(|variant| {
+            let mut same_network = variant.config.clone();
+            same_network.model = first.config.model;
+            let keys = same_network.differences(&first.config);
+            keys.into_iter()
+                .map(|key| format!("{}: {key}", variant.name))
+        });
+        differing.collect()
+    }
+}
+
+impl AblationFile {
+    fn problems(&self) -> Vec<String> {
+        let mut problems = Vec::new();
+        if self.seeds.is_empty() {
+            problems.push("seeds: expected at least one".into());
+        }
+        for (i, seed) in self.seeds.iter().enumerate() {
+            if self.seeds[..i].contains(seed) {
+                problems.push(format!("seeds: {seed} is listed twice"));
+            }
+        }
+        if self.variants.len() < 2 {
+            problems.push("variants: expected at least two".into());
+        }
+        for (i, VariantEntry { name, .. }) in self.variants.iter().enumerate() {
+            let plain = |c: char| c.is_alphanumeric() || "-_+. ".contains(c);
+            if name.trim().is_empty() || name.starts_with('.') || !name.chars().all(plain) {
+                problems.push(format!("variants: `{name}` is not a valid directory name"));
+            }
+            if self.variants[..i].iter().any(|other| other.name == *name) {
+                problems.push(format!("variants: `{name}` is listed twice"));
+            }
+        }
+        problems
+    }
+}
+
+/// Gives every other variant the width with the parameter count closest to the first one's.
+fn match_parameters(variants: &mut [AblationVariant]) {
+    if let Some((first, others)) = variants.split_first_mut() {
+        let parameters = first.config.model.parameter_count();
+        for variant in others {
+            let model = variant.config.model;
+            variant.config.model = ModelConfig {
+                width: model.width_for(parameters),
+                ..model
+            };
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(text: &str) -> Result<AblationSpec, String> {
+        let dir = tempfile::tempdir().unwrap();
+        let base = dir.path().join("base.toml");
+        std::fs::write(&base, "[model]\nwidth = 16\n").unwrap();
+        let path = dir.path().join("ablation.toml");
+        let text = format!("base = {base:?}\ndir = \"runs/x\"\n{text}");
+        std::fs::write(&path, text).unwrap();
+        AblationSpec::load(&path, &["train.steps=7".into()]).map_err(|error| error.to_string())
+    }
+
+    const TWO: &str = "[[variants]]\nname = \"DEMC\"\n[[variants]]\nname = \"SEMC\"\nset = [\"model.variant=semc\"]\n";
+
+    #[test]
+    fn variants_get_matched_parameters_and_all_edits() {
+        let spec = load(TWO).unwrap();
+        let [demc, semc] = &spec.variants[..] else {
+            panic!("{spec:?}")
+        };
+        assert_eq!((demc.config.model.width, semc.config.train.steps), (16, 7));
+        let [a, b] = [demc, semc].map(|v| v.config.model.parameter_count() as f64);
+        assert!((b / a - 1.0).abs() < 0.05, "{a} {b}");
+        assert!(semc.config.model.width > 16);
+        assert_eq!(spec.differences(), Vec::<String>::new());
+        let run = spec.run(semc, 3);
+        assert_eq!(run.train.seed, 3);
+        assert!(run.run_dir().ends_with("runs/x/SEMC-seed-3"));
+    }
+
+    #[test]
+    fn widths_stay_without_matching() {
+        let spec = load(&format!("match_parameters = false\n{TWO}")).unwrap();
+        assert!(spec.variants.iter().all(|v| v.config.model.width == 16));
+    }
+
+    #[test]
+    fn further_differences_are_named() {
+        let text = TWO.replace("semc\"]", "semc\", \"optimizer.lr_start=0.5\"]");
+        let spec = load(&text).unwrap();
+        assert_eq!(
+            spec.differences(),
+            ["SEMC: optimizer.lr_start: 0.5 instead of 0.0001"]
+        );
+    }
+
+    /// Tests run in the folder of their crate, but `base` starts at that of the workspace.
+    #[test]
+    fn the_ablations_of_the_repository_are_valid() {
+        let workspace = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/.."));
+        let no_albedo = "color-only: data.albedo_demodulation_epsilon: absent instead of 0.07";
+        for (folder, differences) in [("configs", vec![no_albedo]), ("results/renders", vec![])] {
+            let folder = workspace.join(folder);
+            let text = std::fs::read_to_string(folder.join("ablation.toml")).unwrap();
+            let relative = text
+                .lines()
+                .find(|line| line.starts_with("base = "))
+                .unwrap();
+            let base = workspace.join(relative.split('"').nth(1).unwrap());
+            let dir = tempfile::tempdir().unwrap();
+            let path = dir.path().join("ablation.toml");
+            std::fs::write(&path, text.replace(relative, &format!("base = {base:?}"))).unwrap();
+            let spec = AblationSpec::load(&path, &[]).unwrap();
+            let names: Vec<_> = spec.variants.iter().map(|v| &v.name).collect();
+            assert_eq!(names, ["DEMC", "DEMCnoSN", "SEMC", "color-only"]);
+            assert_eq!(spec.differences(), differences);
+        }
+    }
+
+    #[test]
+    fn all_problems_are_named_at_once() {
+        let text =
+            "seeds = [1, 1]\n[[variants]]\nname = \"../up\"\n[[variants]]\nname = \"../up\"\n";
+        let error = load(text).unwrap_err();
+        for words in [
+            "seeds: 1 is listed twice",
+            "`../up` is not a valid",
+            "`../up` is listed twice",
+        ] {
+            assert!(error.contains(words), "{words}: {error}");
+        }
+        let error = load("seeds = []\n[[variants]]\nname = \"a\"\n").unwrap_err();
+        assert!(
+            error.contains("seeds: expected at least one") && error.contains("at least two"),
+            "{error}"
+        );
+        assert!(
+            load("seed = 1\n")
+                .unwrap_err()
+                .contains("unknown field `seed`")
+        );
+        let error = load(&TWO.replace("model.variant", "model.varient")).unwrap_err();
+        assert!(error.contains("did you mean `model.variant`?"), "{error}");
+    }
+}

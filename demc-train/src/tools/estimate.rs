@@ -1,0 +1,166 @@
+//! Estimates the duration of a run from a few discarded training steps.
+
+use std::convert::Infallible;
+use std::fmt;
+use std::time::Instant;
+
+use burn::tensor::Device;
+use demc_data::{Batch, FEATURES, Patch};
+
+use crate::config::Config;
+use crate::run::data::RunData;
+use crate::run::initial::random_network;
+use crate::step::optimizer::Optimizer;
+use crate::step::trainer::Trainer;
+
+/// Share of the forward pass in a step. Ours: measured between 0.2 and 0.4.
+const FORWARD_SHARE: f64 = 0.3;
+
+/// Patches in the larger of two timed batches. Ours: enough to fill the kernels.
+const LARGE_BATCH: usize = 4;
+
+/// A step of more seconds than this is timed once. Ours: work done once, such as compiling shaders,
+/// is a small part of it.
+const LONG_STEP: f64 = 30.0;
+
+/// Number of timed steps; the first ones find cold caches (ours).
+const REPETITIONS: u32 = 6;
+/// Seconds after which timing stops, so that the run starts soon (ours).
+const TIME_LIMIT: f64 = 1.0;
+
+/// Estimated duration of a run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DurationEstimate {
+    /// Seconds per step.
+    pub step: f64,
+    /// Seconds per validation.
+    pub validation: f64,
+    /// Seconds for the remaining steps and validations.
+    pub remaining: f64,
+}
+
+impl DurationEstimate {
+    /// Estimates the time of the steps after `first_step`.
+    ///
+    /// It times steps on one patch and on four, which gives the time per patch and the constant
+    /// time per step.
+    pub fn measure(config: &Config, data: &RunData, first_step: u64, device: &Device) -> Self {
+        let mut single = config.clone();
+        single.train.grad_accumulation = 1;
+        let model = random_network(&config.model, 0, data.normalizer.flat_color, device);
+        let mut trainer = Trainer::new(
+            &single,
+            model,
+            Optimizer::new(&single),
+            None,
+            device.clone(),
+        );
+        let mut time_step = |batch: &Batch| {
+            let started = Instant::now();
+            let Ok(_) = trainer.step(0.0, || Ok::<_, Infallible>(batch.clone()));
+            started.elapsed().as_secs_f64()
+        };
+        let mut time = |patches: usize| {
+            let batch = grey_batch(patches, config.data.patch_size);
+            let (mut least, mut spent, mut times) = (f64::INFINITY, 0.0, 0);
+            while times < 2 && spent < LONG_STEP || times < REPETITIONS && spent < TIME_LIMIT {
+                let time = time_step(&batch);
+                (least, spent, times) = (least.min(time), spent + time, times + 1);
+            }
+            least
+        };
+        // At most a batch of the run: memory may not suffice for more.
+        let large = LARGE_BATCH.min(config.data.batch_size);
+        let one = time(1);
+        let patch_time = patch_time(one, large, if large > 1 { time(large) } else { one });
+        let pixels: usize = data
+            .validation
+            .iter()
+            .map(|scene| scene.width * scene.height)
+            .sum();
+        let patches = pixels as f64 / (config.data.patch_size * config.data.patch_size) as f64;
+        let step = one + patch_time * (config.patches_per_step() - 1) as f64;
+        let validation = patch_time * patches * FORWARD_SHARE;
+        let steps = config.train.steps.saturating_sub(first_step) as f64;
+        let remaining = steps * (step + validation / config.run.validate_every as f64);
+        DurationEstimate {
+            step,
+            validation,
+            remaining,
+        }
+    }
+}
+
+/// Seconds per additional patch, from the times of steps with one patch and with several.
+fn patch_time(one: f64, patches: usize, time: f64) -> f64 {
+    match patches {
+        0 | 1 => one,
+        // Timings are noisy: a patch takes some time, but no more than a step of one patch.
+        _ => ((time - one) / (patches - 1) as f64).clamp(0.1 * one, one),
+    }
+}
+
+fn grey_batch(size: usize, side: usize) -> Batch {
+    let planes = |channels: usize| vec![0.5; size * channels * side * side];
+    let patch = Patch {
+        scene: 0,
+        y: 0,
+        x: 0,
+    };
+    Batch {
+        size,
+        color_gamma: planes(3),
+        features_z: planes(FEATURES),
+        modulation: None,
+        reference_hdr: planes(3),
+        patch_size: side,
+        patches: vec![patch; size],
+    }
+}
+
+impl fmt::Display for DurationEstimate {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "about {} ({} per step)",
+            human(self.remaining),
+            human(self.step)
+        )
+    }
+}
+
+/// `3 days 4 h`, `2 h 5 min`, `3 min 20 s`, `4.2 s`, `250 ms`: at most two units.
+fn human(duration: f64) -> String {
+    let seconds = duration as u64;
+    let (days, hours, minutes) = (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60);
+    match (days, hours, minutes) {
+        (0, 0, 0) if duration < 1.0 => format!("{:.0} ms", 1000.0 * duration),
+        (0, 0, 0) => format!("{duration:.1} s"),
+        (0, 0, _) => format!("{minutes} min {} s", seconds % 60),
+        (0, _, _) => format!("{hours} h {minutes} min"),
+        _ => format!("{days} days {hours} h"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn patch_time_is_the_increase_per_patch() {
+        // 100 ms per step and 50 ms per patch.
+        assert!((patch_time(0.15, 4, 0.3) - 0.05).abs() < 1e-12);
+        assert_eq!(patch_time(0.15, 1, 0.15), 0.15);
+        assert_eq!(patch_time(0.2, 4, 0.1), 0.1 * 0.2);
+        assert_eq!(patch_time(0.2, 2, 0.9), 0.2);
+    }
+
+    #[test]
+    fn durations_have_at_most_two_units() {
+        assert_eq!(human(0.25), "250 ms");
+        assert_eq!(human(4.24), "4.2 s");
+        assert_eq!(human(200.0), "3 min 20 s");
+        assert_eq!(human(7500.0), "2 h 5 min");
+        assert_eq!(human(273_700.0), "3 days 4 h");
+    }
+}
