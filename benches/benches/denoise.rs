@@ -21,12 +21,10 @@ use demc_data::exr::rewrite::{WriteOptions, rewrite};
 use demc_data::frame::{decode_input, read_input};
 use demc_infer::{Bundle, Ensemble, Tiling};
 
-/// The allocator of the binaries.
 #[global_allocator]
 static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
 
 const ROUNDS: usize = 7;
-/// The limit of `demc-infer denoise`.
 const KEPT_BYTES: usize = 256 << 20;
 const WIDTH: usize = 1280;
 const HEIGHT: usize = 720;

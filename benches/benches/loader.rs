@@ -20,7 +20,6 @@ use demc_bench::stopwatch::Spread;
 use demc_data::{BatchLoader, ChannelLayout, DataConfig, Dataset, PatchSource, Statistics};
 use demc_model::LossConfig;
 
-/// The allocator of the binaries.
 #[global_allocator]
 static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
 

@@ -11,7 +11,6 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 
-/// Seed of weights and inputs.
 const SEED: u64 = 1;
 
 /// A batch with height and width, which may differ, unlike in [`Batch`].

@@ -203,7 +203,6 @@ fn serve(
     Ok(())
 }
 
-/// The largest resident set so far (Linux).
 fn peak_mib() -> Option<f64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status

@@ -43,7 +43,6 @@ pub struct PatchSource {
     seed: u64,
 }
 
-/// One patch of the stream, with its augmentation.
 struct PatchDraw {
     patch: Patch,
     variation: Variation,
@@ -162,7 +161,6 @@ impl PatchSource {
         Ok(batch)
     }
 
-    /// The patches of batch `n`, in stream order.
     fn draws(&self, n: u64) -> Vec<PatchDraw> {
         let count = self.patches.len() as u64;
         let mut epoch = n * self.batch_size as u64 / count;
@@ -223,7 +221,6 @@ impl PatchSource {
     }
 }
 
-/// Indices of the planes that become the channels `order`, out of three starting at `first`.
 fn three(first: usize, order: [usize; 3]) -> [usize; 3] {
     order.map(|channel| first + channel)
 }
@@ -239,7 +236,6 @@ fn feature_order(variation: Variation) -> Vec<usize> {
         .collect()
 }
 
-/// Mirrors axes of normals and positions.
 fn mirror(features: &mut [f32], mirrored: [bool; 3], pixels: usize) {
     let vectors = features[..TEXTURES * pixels].chunks_exact_mut(pixels);
     for (plane, mirrored) in vectors.zip(mirrored.into_iter().cycle()) {

@@ -15,7 +15,6 @@ pub struct SceneCache {
     scenes: Vec<Scene>,
     layout: ChannelLayout,
     budget: usize,
-    /// One lock per scene, held while a thread decodes it; other threads wait and then find it.
     turns: Vec<Mutex<()>>,
     kept: Mutex<CachedScenes>,
 }

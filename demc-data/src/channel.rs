@@ -16,9 +16,7 @@ pub struct Channel {
     pub layer: Option<String>,
     /// The pixels that it covers.
     pub window: Window,
-    /// The part's index in the file.
     pub(crate) part: usize,
-    /// The channel's index in the part.
     pub(crate) index: usize,
 }
 

@@ -160,7 +160,6 @@ impl Dataset {
     }
 }
 
-/// Number of base scenes that a `share` of `bases` is.
 fn held_out(share: f64, bases: usize) -> usize {
     if share <= 0.0 || bases < 2 {
         return 0;

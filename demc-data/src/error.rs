@@ -5,53 +5,41 @@ use std::path::PathBuf;
 
 /// An error of this crate.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages explain the fields")]
 pub enum Error {
     /// A file could not be opened or read.
     #[error("cannot read {}", path.display())]
     Read {
-        /// The file.
         path: PathBuf,
-        /// The cause.
         source: std::io::Error,
     },
     /// An output could not be written; no partial file remains.
     #[error("cannot write {}", path.display())]
     Write {
-        /// The output.
         path: PathBuf,
-        /// The cause.
         source: std::io::Error,
     },
     /// Not an OpenEXR file, truncated, damaged, or of an unsupported kind (deep data, subsampling).
     #[error("{}: not a readable OpenEXR file: {detail}", path.display())]
     Exr {
-        /// The file.
         path: PathBuf,
-        /// The decoder's message.
         detail: String,
     },
     /// The file lacks channels that the layout names.
     #[error("{}: no channel {}; the file has {}", path.display(), missing.join(", "), present.join(", "))]
     MissingChannels {
-        /// The file.
         path: PathBuf,
-        /// The missing channels.
         missing: Vec<String>,
-        /// All channels of the file.
         present: Vec<String>,
     },
     /// Two buffers of one image cover different pixels.
     #[error("{}: buffers of different sizes: {a} is {a_window}, {b} is {b_window}", path.display())]
     Sizes {
-        /// The file.
         path: PathBuf,
-        /// A channel.
         a: String,
         /// Its window, as `WxH+X+Y`.
         a_window: String,
-        /// Another channel.
         b: String,
-        /// Its window.
         b_window: String,
     },
     /// A buffer contains NaN or infinity.
@@ -60,11 +48,8 @@ pub enum Error {
         path.display()
     )]
     NonFinite {
-        /// The file.
         path: PathBuf,
-        /// The channel, by its name in the file.
         channel: String,
-        /// The first bad sample.
         value: f32,
         /// Its column, pixels from the left.
         x: usize,
@@ -76,33 +61,26 @@ pub enum Error {
     /// An unusable channel layout.
     #[error("channel layout {name}: {detail}")]
     Layout {
-        /// The preset or file.
         name: String,
-        /// The problem.
         detail: String,
     },
     /// An unusable data set; the message names every problem.
     #[error("data set {}: {}", root.display(), problems.join("; "))]
     Dataset {
-        /// The data set's directory.
         root: PathBuf,
-        /// All problems, one phrase each.
         problems: Vec<String>,
     },
     /// A scene file whose size differs from the manifest.
     #[error("{}: is {found}, but the manifest says {expected}", path.display())]
     SceneSize {
-        /// The file.
         path: PathBuf,
         /// The file's size, as `WxH`.
         found: String,
-        /// The size in the manifest.
         expected: String,
     },
     /// A scene too small for one patch.
     #[error("scene {scene}: {width}x{height} pixels hold no patch of {patch}x{patch}")]
     SceneTooSmall {
-        /// The scene's name.
         scene: String,
         /// Its width in pixels.
         width: usize,

@@ -302,7 +302,6 @@ impl<'a> FrameChannels<'a> {
             .collect()
     }
 
-    /// The window that all channels share.
     fn window<R: Read + Seek>(&self, path: &Path, file: &ExrFile<R>) -> Result<Window, Error> {
         let names = self.names();
         let mut channels = names.iter().filter_map(|name| file.channel(name));
@@ -324,7 +323,6 @@ fn slots(names: &Triple) -> Vec<Option<&str>> {
     names.iter().map(|name| Some(name.as_str())).collect()
 }
 
-/// Concatenates planes of one size.
 fn planar(planes: &[Plane]) -> Vec<f32> {
     let pixels = planes.first().map_or(0, Plane::len);
     let mut samples = vec![0.0; planes.len() * pixels];

@@ -194,7 +194,6 @@ fn mistake(name: &str, detail: String) -> Error {
     }
 }
 
-/// A TOML error as `line N: message`.
 fn one_line(error: &toml::de::Error, text: &str) -> String {
     let message = error.message().trim_end().replace('\n', ", ");
     // A key may contain terminal control codes.

@@ -84,7 +84,6 @@ impl Plane {
     }
 }
 
-/// Counts first, which is faster for the usual plane without bad samples.
 fn bad<T: Copy>(
     samples: &[T],
     finite: impl Fn(T) -> bool,

@@ -65,7 +65,6 @@ pub struct Range {
 }
 
 impl Range {
-    /// The range of `values`; from 0 to 0 if there are none.
     fn of(mut values: Vec<f64>) -> Self {
         values.sort_by(f64::total_cmp);
         let last = values.len().saturating_sub(1) as f64;
@@ -77,7 +76,6 @@ impl Range {
         }
     }
 
-    /// The smallest range that contains both.
     fn with(self, other: Self) -> Self {
         Self {
             low: self.low.min(other.low),

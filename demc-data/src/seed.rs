@@ -4,7 +4,6 @@
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-/// The purpose of a stream of random numbers; each purpose has its own streams.
 #[derive(Clone, Copy)]
 pub(crate) enum RandomStream {
     Validation = 1,
@@ -12,7 +11,6 @@ pub(crate) enum RandomStream {
     Augment = 3,
 }
 
-/// The generator of one purpose at (`seed`, `epoch`, `position`).
 pub(crate) fn generator(purpose: RandomStream, seed: u64, epoch: u64, position: u64) -> ChaCha8Rng {
     let mut bytes = [0; 32];
     for (part, value) in bytes

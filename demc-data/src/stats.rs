@@ -92,7 +92,6 @@ impl Statistics {
     }
 }
 
-/// The sums of one scene, or of several.
 #[derive(Default)]
 struct SceneSums {
     features: [ChannelMoments; FEATURES],

@@ -72,7 +72,6 @@ fn a_batch_larger_than_an_epoch_takes_from_several() {
     assert_eq!(patches.len(), 90);
 }
 
-/// Patches on the grid and off the grid.
 #[test]
 fn a_patch_holds_the_pixels_of_its_place() {
     holds_the_pixels_of_its_place(&source(&small()));

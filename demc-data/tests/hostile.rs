@@ -43,7 +43,6 @@ fn bytes_of(headers: Vec<exr::meta::header::Header>) -> Vec<u8> {
     fs::read(&path).expect("just written")
 }
 
-/// Replaces bytes, which must be present.
 fn replaced(bytes: &[u8], old: &[u8], new: &[u8]) -> Vec<u8> {
     let start = bytes
         .windows(old.len())

@@ -233,7 +233,6 @@ fn equal_images_give_equal_bytes() {
     }
 }
 
-/// The stored blocks of a part.
 fn blocks(path: &Path, part: usize) -> Vec<String> {
     let file = BufReader::new(File::open(path).expect("readable"));
     let chunks = exr::block::read(file, false).and_then(|file| file.all_chunks(false));

@@ -22,6 +22,7 @@ pub struct Baseline {
 /// Why a baseline cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[allow(missing_docs, reason = "the messages explain the fields")]
 pub enum BaselineError {
     /// Not `NAME=DIR`.
     #[error("{0:?} is not NAME=DIR")]
@@ -32,19 +33,15 @@ pub enum BaselineError {
     /// Missing images.
     #[error("baseline {name}: missing {}", paths.join(", "))]
     Missing {
-        /// The baseline.
         name: String,
-        /// All missing files.
         paths: Vec<String>,
     },
     /// An image of another size.
     #[error("{}: is {found}, but the scene is {expected}", path.display())]
     Size {
-        /// The image.
         path: PathBuf,
         /// Its size, as `WxH`.
         found: String,
-        /// The scene's size.
         expected: String,
     },
     /// An image cannot be read, or holds NaN or infinite values.
@@ -67,7 +64,6 @@ impl FromStr for Baseline {
 }
 
 impl Baseline {
-    /// Path of the image of `scene`.
     fn path(&self, scene: &Scene) -> PathBuf {
         let stem = scene.path.file_stem().unwrap_or(OsStr::new(&scene.name));
         let mut file = stem.to_owned();

@@ -17,37 +17,31 @@ pub const KNOWN: &str = "flex, ndarray, wgpu[:N], cuda[:N]";
 /// Why a device cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
+#[allow(missing_docs, reason = "the messages explain the fields")]
 pub enum DeviceError {
     /// The name is unknown.
     #[error("unknown device `{name}`; known devices: {KNOWN}")]
     Unknown {
-        /// The given name.
         name: String,
     },
     /// The backend exists, but is not in this build.
     #[error("device `{name}`: not in this build; build with `--features {feature}`")]
     NotBuilt {
-        /// The given name.
         name: String,
-        /// The cargo feature that adds it.
         feature: &'static str,
     },
     /// The runtime lists no such device on this machine.
     #[error("device `{name}`: not on this machine, which has {found} such device(s); {hint}")]
     Absent {
-        /// The given name.
         name: String,
         /// Number of devices of this backend.
         found: usize,
-        /// The backend's requirements.
         hint: &'static str,
     },
     /// The device is listed, but a test computation on it failed.
     #[error("device `{name}`: a test computation failed: {reason}")]
     Broken {
-        /// The given name.
         name: String,
-        /// First line of the runtime's error.
         reason: String,
     },
 }

@@ -10,10 +10,8 @@ use std::str::FromStr;
 
 use burn::tensor::Tensor;
 
-/// Axis of the rows in a planar batch.
 const ROWS: usize = 2;
 
-/// Axis of the columns.
 const COLUMNS: usize = 3;
 
 /// Number of passes over copies of an image.
@@ -93,7 +91,6 @@ impl FromStr for Ensemble {
 struct Symmetry(usize);
 
 impl Symmetry {
-    /// Reverses rows and columns as bits 0 and 1 say.
     fn flip(self, image: Tensor<4>) -> Tensor<4> {
         match self.0 & 3 {
             0 => image,
@@ -103,7 +100,6 @@ impl Symmetry {
         }
     }
 
-    /// Transposes if bit 2 is set.
     fn transpose(self, image: Tensor<4>) -> Tensor<4> {
         match self.0 & 4 {
             0 => image,
@@ -111,7 +107,6 @@ impl Symmetry {
         }
     }
 
-    /// The transformed image.
     fn apply(self, image: Tensor<4>) -> Tensor<4> {
         self.transpose(self.flip(image))
     }
@@ -127,7 +122,6 @@ mod tests {
     use super::*;
     use burn::tensor::{Device, TensorData};
 
-    /// `[1, 2, 2, 3]` with distinct values.
     fn image() -> Tensor<4> {
         let values: Vec<f32> = (0..12).map(|i| i as f32).collect();
         Tensor::from_data(TensorData::new(values, [1, 2, 2, 3]), &Device::flex())

@@ -10,17 +10,14 @@ use crate::memory::TooLarge;
 /// Why a frame cannot be denoised or scored.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[allow(missing_docs, reason = "the messages explain the fields")]
 pub enum DenoiseError {
     /// A buffer does not have the frame's size.
     #[error("{name}: {buffer} holds {found} values; {width}x{height} pixels need {expected}")]
     Size {
-        /// The frame.
         name: String,
-        /// The buffer.
         buffer: &'static str,
-        /// Its number of values.
         found: usize,
-        /// The number of values that the frame's size requires.
         expected: usize,
         /// The frame's width in pixels.
         width: usize,
@@ -30,9 +27,7 @@ pub enum DenoiseError {
     /// The image does not fit into memory.
     #[error("{name}")]
     Memory {
-        /// The frame.
         name: String,
-        /// Required and available memory.
         source: TooLarge,
     },
     /// A feature channel is far from the training data: another unit, or another buffer.
@@ -42,17 +37,13 @@ pub enum DenoiseError {
          training mean {mean:.4}, deviation {std:.4}. Is it in another unit, or another buffer?"
     )]
     Statistics {
-        /// The frame.
         name: String,
-        /// The channel.
         channel: &'static str,
         /// Its root mean square distance from the training mean, in training deviations.
         rms: f64,
         /// The largest distance that is accepted, [`FARTHEST_RMS`](crate::guard::FARTHEST_RMS).
         limit: f64,
-        /// The channel's mean over the training scenes.
         mean: f32,
-        /// The channel's standard deviation over the training scenes.
         std: f32,
     },
     /// The network's output has NaN or infinite values.
@@ -61,7 +52,6 @@ pub enum DenoiseError {
          the training data's statistics, or the weights are damaged"
     )]
     NonFinite {
-        /// The frame.
         name: String,
         /// Number of such values.
         count: usize,
@@ -69,17 +59,13 @@ pub enum DenoiseError {
     /// The device failed to compute or to return the image.
     #[error("{name}: the device failed")]
     Device {
-        /// The frame.
         name: String,
-        /// The device's error.
         source: TensorReadError,
     },
     /// An image with NaN or infinite values has no score.
     #[error("{name}: {what}")]
     Image {
-        /// The frame.
         name: String,
-        /// Which of its images.
         what: String,
         /// Number and kind of the values.
         source: ImageError,
@@ -87,12 +73,10 @@ pub enum DenoiseError {
     /// The frame has no reference to compare with.
     #[error("{name}: no reference in the file")]
     NoReference {
-        /// The frame.
         name: String,
     },
 }
 
-/// Checks that the frame's buffers have its size.
 pub(crate) fn check_sizes(frame: &Frame) -> Result<(), DenoiseError> {
     let Frame { width, height, .. } = *frame;
     let checks = [

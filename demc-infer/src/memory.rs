@@ -46,7 +46,6 @@ pub fn available() -> Option<u64> {
     available_below(Path::new("/")).map(|bytes| bytes + reusable_bytes())
 }
 
-/// Available bytes according to the files below `root`.
 fn available_below(root: &Path) -> Option<u64> {
     let machine = value(&root.join("proc/meminfo"), "MemAvailable:")? << 10;
     let groups = control_groups(root).into_iter();
@@ -114,7 +113,6 @@ fn control_groups(root: &Path) -> Vec<ControlGroup> {
     groups
 }
 
-/// The number in the line of `file` that starts with `name`.
 fn value(file: &Path, name: &str) -> Option<u64> {
     let text = fs::read_to_string(file).ok()?;
     let mut fields = text
@@ -128,7 +126,6 @@ fn value(file: &Path, name: &str) -> Option<u64> {
 mod tests {
     use super::*;
 
-    /// A root directory with these files.
     fn system(files: &[(&str, &str)]) -> tempfile::TempDir {
         let root = tempfile::tempdir().expect("a directory");
         for (path, text) in files {

@@ -9,7 +9,6 @@ use demc_model::metrics::DISPLAY_GAMMA;
 
 /// Pixels between two pictures of a strip.
 const GAP: usize = 4;
-/// Colour of the gap.
 const GAP_RGB: [u8; 3] = [255; 3];
 /// Share of a detail map's values that are not clipped, so that a few bright pixels do not darken
 /// the rest.

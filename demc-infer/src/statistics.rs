@@ -90,7 +90,6 @@ impl Estimate {
     }
 }
 
-/// A quantile of sorted values, with linear interpolation.
 fn quantile(sorted: &[f64], share: f64) -> f64 {
     let position = share * (sorted.len() - 1) as f64;
     let (below, rest) = (position.floor() as usize, position.fract());
@@ -163,7 +162,6 @@ mod tests {
         );
     }
 
-    /// Images differ far more than the two variants: only pairing detects the difference.
     #[test]
     fn pairing_finds_a_small_difference_between_widely_different_images() {
         let mut rng = ChaCha8Rng::seed_from_u64(6);
@@ -182,7 +180,6 @@ mod tests {
         assert!(a.interval[1] > b.interval[0], "unpaired they overlap");
     }
 
-    /// An effect of the seed on all images widens the interval for any number of images.
     #[test]
     fn seeds_that_disagree_widen_the_interval() {
         let mut rng = ChaCha8Rng::seed_from_u64(7);

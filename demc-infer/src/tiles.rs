@@ -177,7 +177,6 @@ fn longest(spans: &[Span]) -> usize {
 mod tests {
     use super::*;
 
-    /// A memory need of one byte per pixel.
     fn pixels(height: usize, width: usize) -> u64 {
         (height * width) as u64
     }

@@ -165,7 +165,6 @@ fn invalid_flags_are_exit_code_2() {
     assert_eq!(outcome.code, 2, "{}", outcome.stderr);
 }
 
-/// The page has the numbers of `evaluate`. `report_browser.rs` tests its behaviour.
 #[test]
 fn a_report_is_one_file_with_the_numbers_of_evaluate() {
     let run = run_directory();

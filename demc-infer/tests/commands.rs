@@ -14,13 +14,11 @@ fn json(path: &Path) -> Value {
     serde_json::from_slice(&fs::read(path).expect("file")).expect("JSON")
 }
 
-/// `demc-infer evaluate` of a model on the sample.
 fn evaluate(model: &Path, flags: &[&str]) -> Outcome {
     let list = arguments!["evaluate", "--model", model, "--data", sample()];
     demc_infer(list.into_iter().chain(flags.iter().map(OsString::from)))
 }
 
-/// The scores from `demc-infer evaluate`.
 fn scores(model: &Path, flags: &[&str]) -> Value {
     let outcome = evaluate(model, &[&["--json", "-"], flags].concat()).success();
     serde_json::from_str(&outcome.stdout).expect("only JSON")
@@ -236,7 +234,6 @@ fn no_arguments_show_the_commands() {
     }
 }
 
-/// Kernels, Burn's operations, and every instruction set of this machine give the same score.
 #[test]
 fn operations_and_instruction_sets_give_the_same_score() {
     use demc_model::ops::Isa;
@@ -267,7 +264,6 @@ fn unknown_operations_and_instruction_sets_are_usage_errors() {
     }
 }
 
-/// Every number of passes gives another image; only 1, 4 and 8 are accepted.
 #[test]
 fn ensemble_takes_1_4_or_8_passes() {
     let run = run_directory();

@@ -10,7 +10,6 @@ use demc_data::exr::ExrFile;
 use demc_data::plane::Plane;
 use demc_data::read_frame;
 
-/// Runs `denoise` on `inputs`.
 fn denoise(model: &Path, inputs: &[&Path], output: &Path) -> Outcome {
     let mut list = arguments!["denoise", "--model", model, "-o", output].to_vec();
     list.extend(inputs.iter().map(|path| path.into()));
@@ -180,7 +179,6 @@ fn channels_that_do_not_fit_the_layout_are_listed() {
     );
 }
 
-/// The default is the bundled model, which was not trained on the sample's test scenes.
 #[test]
 fn the_bundled_model_denoises() {
     let out = tempfile::tempdir().expect("directory");
@@ -205,7 +203,6 @@ fn the_bundled_model_denoises() {
     );
 }
 
-/// The bundled model is part of the program and of the repository.
 #[test]
 fn the_bundled_model_is_small() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/demc.safetensors");
@@ -291,7 +288,6 @@ fn a_sequence_is_denoised_frame_by_frame() {
     );
 }
 
-/// Compares the whole image with tiles in float files.
 #[test]
 fn tiles_are_reported_and_equal_the_whole_image() {
     let (run, dir) = (run_directory(), tempfile::tempdir().expect("directory"));

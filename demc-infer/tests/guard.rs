@@ -6,7 +6,6 @@ use common::{demc_infer, random_bundle, sample};
 use demc_data::{Dataset, Frame, Split, Statistics, read_frame};
 use demc_infer::{Bundle, Names, Precision};
 
-/// A network with the statistics of the sample's training scenes, and all of the sample's frames.
 fn trained() -> (Bundle, Vec<(Split, Frame)>) {
     let mut bundle = random_bundle();
     let layout = bundle.meta.layout.clone();

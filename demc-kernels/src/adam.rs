@@ -61,7 +61,6 @@ pub fn step(
     });
 }
 
-/// The scalars of a step.
 #[derive(Clone, Copy)]
 struct StepFactors {
     beta_1: f32,
@@ -128,7 +127,6 @@ mod tests {
         epsilon: 1e-8,
     };
 
-    /// Weight and moments after `steps` steps.
     fn run(isa: Isa, size: usize, steps: u64) -> [Vec<f32>; 3] {
         let (mut weight, mut first, mut second) =
             (pattern(size, 1), vec![0.0; size], vec![0.0; size]);
@@ -146,7 +144,6 @@ mod tests {
         [weight, first, second]
     }
 
-    /// Algorithm 1 of the paper, in float64.
     fn paper(size: usize, steps: u64) -> [Vec<f64>; 3] {
         let float64 =
             |values: Vec<f32>| -> Vec<f64> { values.into_iter().map(f64::from).collect() };

@@ -36,7 +36,6 @@ struct UpdateAverage<'a> {
 impl Leaf for UpdateAverage<'_> {
     type Out = ();
 
-    /// A plain loop that the compiler vectorises for the path.
     #[inline(always)]
     unsafe fn run<S: Simd>(self) {
         for (average, live) in self.average.iter_mut().zip(self.live) {

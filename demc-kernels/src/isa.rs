@@ -39,7 +39,6 @@ fn list(paths: &[Isa]) -> String {
 }
 
 impl Isa {
-    /// All paths, the best first.
     const ALL: [Isa; 4] = [Isa::Avx512, Isa::Avx2, Isa::Neon, Isa::Portable];
 
     /// Name in switches and reports.
@@ -52,7 +51,6 @@ impl Isa {
         }
     }
 
-    /// Whether this machine has the path.
     pub(crate) fn is_available(self) -> bool {
         // Miri runs no vendor instructions.
         if cfg!(miri) {

@@ -92,7 +92,6 @@ pub fn backward(isa: Isa, grid: Grid, x: &[f32], dy: &[f32], dx: &mut [f32]) {
     });
 }
 
-/// Checks all lengths and returns the number of channels.
 #[track_caller]
 fn check(grid: Grid, len: usize, half_len: usize) -> usize {
     let channels = grid.channels(len);
@@ -288,7 +287,6 @@ mod tests {
             .collect()
     }
 
-    /// Values and positions of the first maxima.
     fn plain(grid: Grid, channels: usize, x: &[f32]) -> Vec<(f32, usize)> {
         let half = grid.halved();
         let mut found = Vec::new();

@@ -58,7 +58,6 @@ fn taps4x4(grid: Grid) -> impl Iterator<Item = (usize, usize, usize)> {
     })
 }
 
-/// Applies ReLU to `y` if `relu`.
 fn rectified(mut y: Vec<f64>, relu: bool) -> Vec<f64> {
     if relu {
         y.iter_mut().for_each(|y| *y = y.max(0.0));

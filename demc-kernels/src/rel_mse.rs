@@ -97,7 +97,6 @@ struct LossTerm {
 }
 
 impl LossTerm {
-    /// One value's term of the sum, and its gradient.
     #[inline(always)]
     fn term(self, out: f32, reference: f32) -> (f64, f64) {
         let (out, reference) = (f64::from(out), f64::from(reference));
@@ -228,7 +227,6 @@ mod tests {
         )
     }
 
-    /// Eq. 5 and its gradient.
     fn plain(
         out: &[f32],
         reference: &[f32],

@@ -12,7 +12,6 @@ use crate::memory;
 #[repr(align(64))]
 struct CacheLine(#[allow(dead_code, reason = "read through a pointer")] [f32; LINE]);
 
-/// Values in a cache line.
 const LINE: usize = 16;
 
 static POOL: Mutex<Vec<Vec<CacheLine>>> = Mutex::new(Vec::new());
@@ -49,7 +48,6 @@ impl Scratch {
         Scratch { lines, len }
     }
 
-    /// A buffer of `len` zeros.
     pub(crate) fn zeroed(len: usize) -> Self {
         let mut scratch = Self::take(len);
         scratch.fill(0.0);
@@ -100,7 +98,6 @@ impl Shared {
         Shared(slice.as_mut_ptr())
     }
 
-    /// The pointer, advanced by `values`.
     pub(crate) fn offset(self, values: usize) -> Self {
         Shared(self.0.wrapping_add(values))
     }

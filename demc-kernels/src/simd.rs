@@ -10,7 +10,6 @@
 
 use crate::Isa;
 
-/// Values in the widest vector of all paths.
 pub(crate) const WIDEST: usize = 16;
 
 /// A vector type and its operations.
@@ -18,9 +17,7 @@ pub(crate) const WIDEST: usize = 16;
 /// Every function needs the instructions of its path, which [`run`] checks. Functions on pointers
 /// need their values to be readable or writable, without alignment.
 pub(crate) unsafe trait Simd: Copy + Send + Sync + 'static {
-    /// A vector.
     type V: Copy;
-    /// Values in a vector.
     const LANES: usize;
     /// Accumulators of a product that fit into the registers besides its operands.
     const ACCUMULATORS: usize;
@@ -59,7 +56,6 @@ pub(crate) unsafe trait Simd: Copy + Send + Sync + 'static {
 
 /// Work for one thread.
 pub(crate) trait Leaf {
-    /// The result.
     type Out;
     /// Does the work. Implementations are `#[inline(always)]`.
     ///

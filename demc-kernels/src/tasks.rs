@@ -32,7 +32,6 @@ pub(crate) fn each<P: Send>(pieces: impl Iterator<Item = P>, work: impl Fn(P) + 
     map(pieces, work);
 }
 
-/// Maps `work` over the pieces, in order.
 pub(crate) fn map<P: Send, R: Send>(
     pieces: impl Iterator<Item = P>,
     work: impl Fn(P) -> R + Sync + Send,

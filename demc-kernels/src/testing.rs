@@ -31,7 +31,6 @@ pub(crate) fn few<T>(mut cases: Vec<T>, under_miri: usize) -> Vec<T> {
     cases
 }
 
-/// Values from -1 to 1 with a long period.
 pub(crate) fn pattern(len: usize, seed: u32) -> Vec<f32> {
     let mut state = seed.wrapping_mul(2654435769);
     let next = || {
@@ -77,7 +76,6 @@ pub(crate) fn same_on_any_number_of_threads<R: PartialEq + Send>(work: impl Fn()
     );
 }
 
-/// The bits of values, to compare them including NaN.
 pub(crate) fn bits(x: &[f32]) -> Vec<u32> {
     x.iter().map(|x| x.to_bits()).collect()
 }

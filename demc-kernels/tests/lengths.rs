@@ -12,7 +12,6 @@ const GRID: Grid = Grid {
     height: 4,
     width: 6,
 };
-/// Pixels of [`GRID`].
 const P: usize = 24;
 
 /// Runs an operation on zeroed slices of `lengths`, which match. Then makes each slice one value

@@ -57,7 +57,6 @@ impl ConvBlock {
     }
 }
 
-/// A 3x3 convolution that keeps height and width.
 pub(crate) fn conv3x3(
     b: &mut Builder,
     channels: [usize; 2],
@@ -119,7 +118,6 @@ pub(crate) fn deconv4x4(
     })
 }
 
-/// A batch normalisation, initialised as the identity.
 pub(crate) fn norm(b: &mut Builder, channels: usize) -> Result<BatchNorm, WeightsError> {
     Ok(BatchNorm {
         gamma: b.parameter("gamma", Role::NormScale, [channels], Init::Ones)?,

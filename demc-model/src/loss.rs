@@ -130,7 +130,6 @@ pub fn gamma_from_hdr(image_hdr: Tensor<4>, gamma: f32) -> Tensor<4> {
     image_hdr.clamp_min(0.0).powf_scalar(1.0 / gamma)
 }
 
-/// SMAPE of each image, in linear HDR.
 fn smape(out_hdr: Tensor<4>, ref_hdr: Tensor<4>) -> Tensor<1> {
     let sizes = out_hdr.clone().abs() + ref_hdr.clone().abs();
     mean_per_image((out_hdr - ref_hdr).abs() / sizes.add_scalar(SMAPE_EPSILON))
@@ -207,7 +206,6 @@ mod tests {
         losses.into_data().try_to_vec().unwrap()
     }
 
-    /// Each term alone, with its name.
     const TERMS: [(&str, LossConfig); 3] = {
         let none = LossConfig {
             relmse: 0.0,
@@ -268,7 +266,6 @@ mod tests {
         }
     }
 
-    /// The gradient against central differences of the loss.
     #[test]
     fn every_gradient_agrees_with_differences() {
         let device = Device::flex().autodiff();

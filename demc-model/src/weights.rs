@@ -161,7 +161,6 @@ impl Weights {
         Ok(weight.data)
     }
 
-    /// Fails if a weight has not been taken.
     pub(crate) fn all_taken(&self) -> Result<(), WeightsError> {
         match self.0.keys().next() {
             None => Ok(()),
@@ -175,27 +174,23 @@ impl Weights {
 
 /// A difference between weights and the network that a [`crate::ModelConfig`] describes.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
+#[allow(missing_docs, reason = "the messages explain the fields")]
 pub enum WeightsError {
     /// A tensor of the network is missing.
     #[error("weight {name} is missing")]
     Missing {
-        /// Name of the tensor.
         name: String,
     },
     /// A tensor has another shape.
     #[error("weight {name}: expected shape {expected:?}, found {found:?}")]
     Shape {
-        /// Name of the tensor.
         name: String,
-        /// Shape in the network.
         expected: Vec<usize>,
-        /// Shape in the file.
         found: Vec<usize>,
     },
     /// The network does not have these tensors.
     #[error("weight {name} is not part of this network ({count} such weights)")]
     Unknown {
-        /// First of them by name.
         name: String,
         /// Number of unknown tensors.
         count: usize,
@@ -226,13 +221,11 @@ impl<'a> Builder<'a> {
         }
     }
 
-    /// The builder, whose next tensors belong to `stage`.
     pub(crate) fn enter(&mut self, stage: Stage) -> &mut Self {
         self.stage = stage;
         self
     }
 
-    /// Builds a part under `name`.
     pub(crate) fn part<T>(
         &mut self,
         name: impl ToString,
@@ -270,7 +263,6 @@ impl<'a> Builder<'a> {
         Ok(param.set_require_grad(true))
     }
 
-    /// A running statistic of a batch normalisation, which the forward pass updates.
     pub(crate) fn running_state(
         &mut self,
         name: &str,

@@ -58,7 +58,6 @@ fn run(model: &Denoiser, [batch, height, width]: [usize; 3]) -> Vec<f32> {
     out.into_data().try_to_vec().expect("float32")
 }
 
-/// Largest difference as a share of the largest value.
 fn deviation(found: &[f32], expected: &[f32]) -> f32 {
     let scale = expected.iter().fold(0.0f32, |m, x| m.max(x.abs()));
     let differences = found.iter().zip(expected).map(|(f, e)| (f - e).abs());

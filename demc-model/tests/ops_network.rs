@@ -26,10 +26,8 @@ fn tolerance(reading: Reading) -> f32 {
 /// Narrow, and not a multiple of a vector's length.
 const WIDTH: usize = 6;
 
-/// Batch, height and width.
 const SHAPE: [usize; 3] = [2, 64, 32];
 
-/// Values of tensors by name.
 type TensorMap = BTreeMap<String, Vec<f32>>;
 
 fn config(variant: Variant, reading: Reading) -> ModelConfig {

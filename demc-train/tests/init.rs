@@ -94,7 +94,6 @@ fn a_run_starts_from_the_weights_of_another() {
     assert!(output.status.success(), "{}", stderr(&output));
 }
 
-/// The ranges of the scenes of the first run are kept, after a resume too.
 #[test]
 fn ranges_of_the_first_run_are_kept() {
     let dir = tempfile::tempdir().expect("a temporary directory");

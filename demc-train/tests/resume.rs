@@ -54,7 +54,6 @@ fn a_killed_and_resumed_run_equals_an_uninterrupted_one() {
     assert_eq!(kept, 2, "run.keep = 2");
 }
 
-/// The saved configuration alone repeats the run.
 #[test]
 fn the_saved_configuration_repeats_the_run() {
     let dir = tempfile::tempdir().expect("a temporary directory");
@@ -99,8 +98,6 @@ fn a_directory_with_another_run_is_refused() {
     );
 }
 
-/// Whatever is missing or damaged, the run resumes, at worst from the previous checkpoint, with a
-/// note.
 #[test]
 fn missing_and_damaged_files_cost_at_most_one_checkpoint() {
     let dir = tempfile::tempdir().expect("a temporary directory");
@@ -192,7 +189,6 @@ fn checkpoints_of_another_format_are_refused() {
     );
 }
 
-/// `sha256sum -c` accepts the checksums.
 #[test]
 fn checksums_are_those_of_sha256sum() {
     let dir = tempfile::tempdir().expect("a temporary directory");

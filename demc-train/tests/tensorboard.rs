@@ -54,7 +54,6 @@ fn tensorboard_reads_a_resumed_run_like_an_uninterrupted_one() {
     assert_eq!(read["plugin"], expected);
 }
 
-/// Writes six steps; the checkpoint is after the fourth.
 fn write_until_the_crash(run: &Path, strip: &[u8]) -> anyhow::Result<()> {
     let mut events = EventFile::open(run, 0)?;
     events.text(0, "config", CONFIG)?;
@@ -88,7 +87,6 @@ fn write_from_the_checkpoint(run: &Path, strip: &[u8]) -> anyhow::Result<()> {
     events.image(8, "strip", 4, 7, strip)
 }
 
-/// A PNG file.
 fn png(width: u32, height: u32) -> Vec<u8> {
     let mut file = Vec::new();
     let mut encoder = png::Encoder::new(&mut file, width, height);
@@ -115,7 +113,6 @@ fn read(python: &str, run: &Path) -> Value {
     serde_json::from_slice(&output.stdout).expect("JSON")
 }
 
-/// A Python interpreter that imports `tensorboard`, or why there is none.
 fn python_with_tensorboard() -> Result<String, String> {
     let python = std::env::var("DEMC_PYTHON").map_err(|_| "DEMC_PYTHON is not set".to_string())?;
     let output = run_python(&python, ["-c".as_ref(), "import tensorboard".as_ref()])

@@ -61,7 +61,6 @@ fn skipped_steps_are_counted_and_too_many_end_the_run() {
     assert_eq!(lines[1]["skipped"], 3);
 }
 
-/// `train.on_nan` may change at a resume.
 #[test]
 fn a_stopped_run_may_resume_and_skip() {
     let dir = tempfile::tempdir().expect("a temporary directory");
@@ -109,7 +108,6 @@ fn a_second_process_in_the_directory_is_refused() {
     first.wait().expect("a child");
 }
 
-/// A resume removes incomplete files of a killed process.
 #[test]
 fn incomplete_files_of_a_killed_process_are_removed() {
     let dir = tempfile::tempdir().expect("a temporary directory");

@@ -23,7 +23,6 @@ fn stdout(output: &Output) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
-/// An ablation of three small networks with two seeds each and four steps.
 fn ablation(dir: &Path) -> std::path::PathBuf {
     let base = config(dir);
     let path = dir.join("ablation.toml");
@@ -124,7 +123,6 @@ fn invalid_ablations_exit_with_2_and_one_line() {
     assert!(error.contains("/nowhere.toml"), "{error}");
 }
 
-/// The initial weights of all variants are read before the first variant trains.
 #[test]
 fn an_ablation_checks_all_initial_weights_first() {
     let dir = tempfile::tempdir().expect("a temporary directory");

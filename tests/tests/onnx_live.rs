@@ -22,7 +22,6 @@ use rand_chacha::ChaCha8Rng;
 use tempfile::TempDir;
 use tensors::{Tolerance, assert_close};
 
-/// Images, height and width.
 const SIZES: [[usize; 3]; 6] = [
     [1, 32, 32],
     [1, 32, 96],

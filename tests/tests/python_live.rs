@@ -49,7 +49,6 @@ fn repository() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
 }
 
-/// The bundled model.
 fn bundled_model() -> Bundle {
     let path = repository().join("models/demc.safetensors");
     Bundle::load(&path, &Device::flex()).expect("the model loads")

@@ -23,7 +23,6 @@ use peak::Peak;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// The allocator of the binaries.
 #[global_allocator]
 static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
 
@@ -63,7 +62,6 @@ fn main() {
     bench.layouts();
 }
 
-/// The command line options.
 struct Options {
     width: usize,
     rounds: usize,
@@ -348,7 +346,6 @@ fn grid_at(down: usize) -> Grid {
     }
 }
 
-/// Values in (0, 1).
 fn draw(len: usize) -> Vec<f32> {
     let mut rng = ChaCha8Rng::seed_from_u64(len as u64);
     (0..len).map(|_| rng.random_range(1e-3..1.0)).collect()

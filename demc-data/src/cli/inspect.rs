@@ -10,7 +10,6 @@ use demc_data::exr::ExrFile;
 use demc_data::plane::Plane;
 use serde::Serialize;
 
-/// Properties of one channel.
 #[derive(Serialize)]
 struct ChannelRow {
     name: String,
@@ -30,7 +29,6 @@ struct SampleRange {
     mean: f64,
 }
 
-/// All channels of one file.
 #[derive(Serialize)]
 struct FileReport<'a> {
     file: &'a Path,

@@ -38,7 +38,6 @@ enum DataCommand {
     Stats(StatsArguments),
 }
 
-/// Arguments of `inspect`.
 #[derive(Args)]
 #[command(after_help = "Example:\n  demc-data inspect data/sample/train/*.exr")]
 struct InspectArguments {
@@ -50,7 +49,6 @@ struct InspectArguments {
     json: bool,
 }
 
-/// Arguments of `stats`.
 #[derive(Args)]
 #[command(
     after_help = "Examples:\n  demc-data stats data/sample\n  demc-data stats renders --layout my-renderer.toml --json"

@@ -13,12 +13,10 @@ use serde::Serialize;
 /// Epsilon of Eq. 5 (Sec. 4.2).
 const RELMSE_EPSILON: f32 = 0.001;
 
-/// The measurements of a data set.
 #[derive(Serialize)]
 struct DatasetReport<'a> {
     root: &'a Path,
     layout: &'a str,
-    /// All splits that have scenes.
     splits: BTreeMap<Split, SplitContents>,
     /// The split of the measurements below.
     split: Split,
@@ -27,7 +25,6 @@ struct DatasetReport<'a> {
     misses: f64,
     /// Negative samples of colour and reference, which are set to 0.
     negative: u64,
-    /// Mean and standard deviation of each feature.
     features: Vec<FeatureRow>,
     /// The constant reference colour with the least RelMSE, in gamma space.
     flat_color: [f32; 3],
@@ -37,7 +34,6 @@ struct DatasetReport<'a> {
 struct SplitContents {
     scenes: usize,
     base_scenes: BTreeSet<String>,
-    /// Number of scenes of each size.
     sizes: BTreeMap<String, usize>,
     /// Number of patches of the default size, stride and border; none if a scene is too small for a
     /// patch.

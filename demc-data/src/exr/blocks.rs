@@ -32,7 +32,6 @@ pub(super) struct BlockReader<R> {
     blocks: u64,
     /// Length of the file in bytes.
     length: u64,
-    /// Number of threads that decode and encode blocks.
     pub(super) threads: usize,
     pub(super) kept: DecodedBlocks,
 }
@@ -64,7 +63,6 @@ impl BlockGrid {
 }
 
 impl<R: Read + Seek> BlockReader<R> {
-    /// Reads the headers and checks them.
     pub(super) fn open(mut reader: R) -> Result<Self, ExrError> {
         let length = reader.seek(SeekFrom::End(0))?;
         reader.rewind()?;
@@ -134,7 +132,6 @@ impl<R: Read + Seek> BlockReader<R> {
         blocks.into_iter().collect()
     }
 
-    /// Reads the block at this position of the full-size image, still compressed.
     fn block(
         &mut self,
         part: usize,
@@ -244,13 +241,11 @@ pub(super) struct DecodedBlocks {
     /// The parts whose blocks are kept.
     parts: Vec<usize>,
     blocks: HashMap<BlockKey, UncompressedBlock>,
-    /// Bytes of all blocks, and their limit.
     bytes: usize,
     limit: usize,
 }
 
 impl DecodedBlocks {
-    /// Keeps blocks of these parts, up to `limit` bytes.
     pub(super) fn new(parts: Vec<usize>, limit: usize) -> Self {
         Self {
             parts,
@@ -259,7 +254,6 @@ impl DecodedBlocks {
         }
     }
 
-    /// Keeps the blocks of a part that fit within the limit.
     pub(super) fn keep(
         &mut self,
         part: usize,
@@ -278,7 +272,6 @@ impl DecodedBlocks {
         }
     }
 
-    /// Removes and returns a block.
     pub(super) fn take(&mut self, part: usize, place: BlockPosition) -> Option<UncompressedBlock> {
         let block = self.blocks.remove(&(part, place))?;
         self.bytes -= bytes(&block);

@@ -83,7 +83,6 @@ impl Compression {
     }
 }
 
-/// The name of a file's compression.
 pub(super) fn name_of(method: Method) -> &'static str {
     row_of(method).map_or("unknown", |(name, ..)| name)
 }

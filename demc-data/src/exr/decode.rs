@@ -56,7 +56,6 @@ pub(super) struct SampleSpan {
     /// Bytes per pixel in all channels, and in the channels before this one.
     pixel: usize,
     before: usize,
-    /// Bytes per sample.
     sample: usize,
 }
 

@@ -88,15 +88,12 @@ impl fmt::Display for Change {
     }
 }
 
-/// The plan of an output file.
 pub(super) struct RewritePlan {
     pub(super) headers: Headers,
-    /// One for each header.
     pub(super) parts: Vec<PlannedPart>,
     pub(super) changes: Vec<Change>,
 }
 
-/// The source of a part of the output.
 pub(super) struct PlannedPart {
     /// The part's index in the input.
     pub(super) input: usize,
@@ -104,10 +101,8 @@ pub(super) struct PlannedPart {
     pub(super) channels: Option<Vec<ChannelOrigin>>,
 }
 
-/// The source of a channel of the output.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ChannelOrigin {
-    /// Its index in the input's part.
     pub(super) index: usize,
     /// The plane of the denoised colour that replaces it.
     pub(super) plane: Option<usize>,

@@ -67,7 +67,6 @@ pub(super) fn recode<R: Read + Seek>(
 
 struct Recoder<'a, R> {
     input: RewriteInput<'a, R>,
-    /// Headers of the output.
     headers: &'a Headers,
     color_hdr: &'a [f32],
     clamped: usize,
@@ -147,12 +146,10 @@ impl<R: Read + Seek> Recoder<'_, R> {
     }
 }
 
-/// A block of the output.
 struct OutputBlock {
     /// Its index in the table of blocks.
     index: usize,
     tile: TileCoordinates,
-    /// Its position and size in pixels.
     corner: Vec2<usize>,
     size: Vec2<usize>,
 }
@@ -202,7 +199,6 @@ fn assemble(
     (data, clamped)
 }
 
-/// Compresses a block of the output.
 fn compress(
     part: usize,
     header: &Header,
@@ -231,7 +227,6 @@ fn compress(
     })
 }
 
-/// The content of a channel of the output.
 enum ChannelContent {
     /// A plane of the denoised colour.
     Color(usize),

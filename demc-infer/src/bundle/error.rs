@@ -9,13 +9,12 @@ use super::FORMAT;
 /// Why a bundle cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[allow(missing_docs, reason = "the messages explain the fields")]
 pub enum BundleError {
     /// The file or directory cannot be read.
     #[error("cannot read {}", path.display())]
     Read {
-        /// The file or directory.
         path: PathBuf,
-        /// The operating system's error.
         source: std::io::Error,
     },
     /// The file cannot be written.
@@ -27,15 +26,12 @@ pub enum BundleError {
         path.display()
     )]
     NoModel {
-        /// The directory.
         path: PathBuf,
     },
     /// Not a safetensors file, or one cut short.
     #[error("{}: cut short, damaged or no safetensors file: {detail}", path.display())]
     Damaged {
-        /// The file.
         path: PathBuf,
-        /// The decoder's message.
         detail: String,
     },
     /// A safetensors file from another program.
@@ -44,57 +40,43 @@ pub enum BundleError {
         path.display()
     )]
     Foreign {
-        /// The file.
         path: PathBuf,
     },
     /// A bundle from another version of this program.
     #[error("{}: bundle format {found}; this build reads format {FORMAT}", path.display())]
     Format {
-        /// The file.
         path: PathBuf,
-        /// Its format.
         found: u64,
     },
     /// The header's JSON is invalid.
     #[error("{}: header entry `demc`: {detail}", path.display())]
     Header {
-        /// The file.
         path: PathBuf,
-        /// The problems.
         detail: String,
     },
     /// A tensor has a type other than f32 and f16, or holds NaN or infinity.
     #[error("{}: tensor {name}: {detail}", path.display())]
     Tensor {
-        /// The file.
         path: PathBuf,
-        /// The tensor.
         name: String,
-        /// The problem.
         detail: String,
     },
     /// The tensors do not match the network that the header describes.
     #[error("{}", path.display())]
     Weights {
-        /// The file.
         path: PathBuf,
-        /// The first tensor that does not match.
         source: WeightsError,
     },
     /// Imported tensors do not match the network.
     #[error("{}: {problems}", path.display())]
     Import {
-        /// The file.
         path: PathBuf,
-        /// All tensors with a problem, by kind.
         problems: String,
     },
     /// A weight beyond f16's range.
     #[error("tensor {name}: {value} does not fit into f16; export with f32")]
     Overflow {
-        /// The tensor.
         name: String,
-        /// The value.
         value: f32,
     },
     /// The network is too large for one ONNX file.
@@ -102,15 +84,12 @@ pub enum BundleError {
         "the ONNX file would have {bytes} bytes, but protobuf's limit is 2 GiB; export with f16, or use a narrower network"
     )]
     TooLargeForOnnx {
-        /// Size of the file.
         bytes: u64,
     },
     /// The file that was read back differs from what was written.
     #[error("{}: read back after writing, but {what} differs: do not use this file", path.display())]
     ReadBack {
-        /// The file.
         path: PathBuf,
-        /// The part that differs.
         what: String,
     },
     /// The safetensors writer failed; a programmer's error.

@@ -10,7 +10,6 @@ use demc_model::Variant;
 use super::testing::bundle;
 use super::*;
 
-/// A file with this header and data.
 fn file(header: &[u8], data: &[u8]) -> Vec<u8> {
     let length = header.len() as u64;
     [&length.to_le_bytes()[..], header, data].concat()
@@ -48,7 +47,6 @@ fn header(tensors: &str) -> Vec<u8> {
     format!(r#"{{"__metadata__":{metadata}{tensors}}}"#).into_bytes()
 }
 
-/// A tensor's entry in the header.
 fn tensor(name: &str, dtype: &str, shape: &str, from: u64, to: u64) -> String {
     format!(r#","{name}":{{"dtype":"{dtype}","shape":{shape},"data_offsets":[{from},{to}]}}"#)
 }

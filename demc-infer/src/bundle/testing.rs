@@ -34,7 +34,6 @@ pub(crate) fn bundle(variant: Variant) -> Bundle {
     }
 }
 
-/// A frame without reference. Its values follow a pattern between 0 and 1.
 pub(crate) fn frame(width: usize, height: usize) -> Frame {
     let pattern = |channels: usize| {
         let values = 0..channels * width * height;

@@ -16,10 +16,8 @@ const STYLES: [(Names, Precision); 4] = [
     (Names::Torch, Precision::F16),
 ];
 
-/// The tensors of a file: name, type, shape, bytes.
 type TensorList = Vec<(String, Dtype, Vec<usize>, Vec<u8>)>;
 
-/// The error when `tensors` are loaded with the metadata `header` under the key `demc`.
 fn load_error(tensors: &TensorList, header: Option<&str>) -> String {
     let views = tensors.iter().map(|(name, dtype, shape, bytes)| {
         (
@@ -31,7 +29,6 @@ fn load_error(tensors: &TensorList, header: Option<&str>) -> String {
     error_of(&safetensors::serialize(views, metadata).expect("bytes"))
 }
 
-/// The error when a file with these bytes is loaded, without its path.
 fn error_of(bytes: &[u8]) -> String {
     let dir = tempfile::tempdir().expect("directory");
     let path = dir.path().join("x.safetensors");
@@ -48,7 +45,6 @@ fn error_of(bytes: &[u8]) -> String {
         .into()
 }
 
-/// Tensors and header of a valid file.
 fn good() -> (TensorList, String) {
     let bundle = bundle(Variant::Demc);
     let bytes = encode::encode(

@@ -73,7 +73,6 @@ impl Arguments {
     }
 }
 
-/// The metrics with these names, without RelMSE and SSIM; `all` stands for every one.
 fn find_metrics(names: &[String]) -> Result<Vec<&'static Metric>, UsageError> {
     if names.iter().any(|name| name == "all") {
         return Ok(METRICS[2..].iter().collect());

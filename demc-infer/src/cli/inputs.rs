@@ -83,7 +83,6 @@ impl Inputs {
     }
 }
 
-/// The EXR files directly in `path`, sorted by name.
 fn directory(path: &Path) -> Result<Vec<PathBuf>, UsageError> {
     let mut files: Vec<PathBuf> = entries(path)?
         .into_iter()
@@ -109,7 +108,6 @@ fn is_pattern(path: &Path) -> bool {
     path.to_string_lossy().contains(['*', '?', '['])
 }
 
-/// The files that match a pattern, sorted by name.
 fn pattern(argument: &Path) -> Result<Vec<PathBuf>, UsageError> {
     let error =
         |error: &dyn std::fmt::Display| UsageError(format!("{}: {error}", argument.display()));
@@ -134,7 +132,6 @@ struct Sequence<'a> {
 }
 
 impl<'a> Sequence<'a> {
-    /// Parses a file name with `#`s or a `%0Nd`.
     fn parse(argument: &'a Path) -> Option<Self> {
         let name = argument.file_name()?.to_str()?;
         let (start, end, digits) = hashes(name).or_else(|| percent(name))?;
@@ -146,7 +143,6 @@ impl<'a> Sequence<'a> {
         })
     }
 
-    /// The existing frames, sorted by number and limited to `frames`.
     fn files(&self, frames: Option<Frames>) -> Result<Vec<PathBuf>, UsageError> {
         let parent = match self.argument.parent() {
             Some(parent) if parent != Path::new("") => parent,
@@ -197,7 +193,6 @@ fn percent(name: &str) -> Option<(usize, usize, usize)> {
     (name[..end].ends_with('d')).then(|| (start, end, width.parse().unwrap_or(1)))
 }
 
-/// A message about missing frames between the first and the last.
 fn missing(found: &[(u64, PathBuf)], frames: Option<Frames>) -> Option<String> {
     let first = frames.map_or(found.first()?.0, |frames| frames.first);
     let last = frames.map_or(found.last()?.0, |frames| frames.last);
@@ -209,7 +204,6 @@ fn missing(found: &[(u64, PathBuf)], frames: Option<Frames>) -> Option<String> {
 mod tests {
     use super::*;
 
-    /// A directory with these empty files.
     fn directory_of(names: &[&str]) -> tempfile::TempDir {
         let dir = tempfile::tempdir().expect("a directory");
         for name in names {

@@ -39,9 +39,7 @@ struct ModelSummary {
     meta: BundleMeta,
     names: Names,
     precision: Precision,
-    /// Number of trainable values.
     parameters: u64,
-    /// Names and shapes.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     tensors: Vec<(String, Vec<usize>)>,
 }

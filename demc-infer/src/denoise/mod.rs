@@ -142,14 +142,12 @@ impl Bundle {
         Ok(map.map(|map| input.padding.crop(&map)))
     }
 
-    /// The device that holds the model.
     pub(crate) fn device(&self) -> Device {
         let devices = self.model.devices();
         devices.first().expect("every network has weights").clone()
     }
 }
 
-/// A frame, and how it is fed into the network.
 struct FrameInput<'a> {
     bundle: &'a Bundle,
     frame: &'a Frame,
@@ -234,7 +232,6 @@ impl<'a> FrameInput<'a> {
         Ok(out)
     }
 
-    /// Z-scored features, `[1, 12, rows, columns]`.
     fn features_z(&self, rows: PixelRange, columns: PixelRange) -> Tensor<4> {
         let mut planes = self
             .padding

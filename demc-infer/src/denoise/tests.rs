@@ -134,7 +134,6 @@ fn tiles_with_the_exact_halo_are_the_whole_image() {
     }
 }
 
-/// The exact halo is the smallest on the network's grid: with 32 pixels less, the result differs.
 #[test]
 fn a_smaller_halo_is_measured_and_is_worse() {
     let bundle = bundle(Variant::Demc);

@@ -192,7 +192,6 @@ fn methods<'a>(
         .collect()
 }
 
-/// An image of `frame`, prepared for the metrics.
 pub(crate) fn image_of<'a>(
     frame: &Frame,
     what: &str,
@@ -205,7 +204,6 @@ pub(crate) fn image_of<'a>(
     })
 }
 
-/// The reference of `frame`.
 pub(crate) fn reference_of(frame: &Frame) -> Result<Image<'_>, DenoiseError> {
     let no_reference = || DenoiseError::NoReference {
         name: frame.name.clone(),

@@ -6,7 +6,6 @@ use demc_model::metrics::{METRICS, Metric};
 
 use super::{Report, Score, is_headline};
 
-/// Cell of a metric without a value.
 const NONE: &str = "-";
 
 impl Report {
@@ -32,7 +31,6 @@ impl fmt::Display for Report {
     }
 }
 
-/// Name of a metric in a column's head.
 fn label(metric: &Metric) -> &'static str {
     match metric.name {
         "relmse" => "RelMSE",

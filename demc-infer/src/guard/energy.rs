@@ -90,7 +90,6 @@ mod tests {
         }
     }
 
-    /// One bright pixel dominates the mean, so an output without it may be correct.
     #[test]
     fn a_firefly_causes_no_warning() {
         let mut frame = frame(40, 30);

@@ -74,7 +74,6 @@ impl<'a> SurfacePixels<'a> {
         Self { frame, pixels }
     }
 
-    /// The first mistake in the normals.
     fn normals(&self) -> Option<Warning> {
         let length = self.median(|i| norm(vector(self.frame, NORMAL, i)));
         let packed = |i| vector(self.frame, NORMAL, i).map(|x| 2.0 * x - 1.0);
@@ -162,14 +161,12 @@ impl<'a> SurfacePixels<'a> {
         count as f32 / self.pixels.len() as f32
     }
 
-    /// Smallest value of the buffer that starts at plane `first`.
     fn minimum(&self, first: usize) -> f32 {
         let vectors = self.pixels.iter().map(|i| vector(self.frame, first, *i));
         vectors.flatten().fold(f32::INFINITY, f32::min)
     }
 }
 
-/// The vector at pixel `i` of the buffer that starts at plane `first`.
 fn vector(frame: &Frame, first: usize, i: usize) -> Vector {
     let pixels = frame.width * frame.height;
     std::array::from_fn(|channel| frame.features[(first + channel) * pixels + i])

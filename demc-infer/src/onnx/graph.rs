@@ -15,16 +15,13 @@ use crate::bundle::tensors::f32_bytes;
 #[derive(Clone, Debug)]
 pub(super) struct Value(pub(super) String);
 
-/// The attributes of an operator by name.
 pub(super) type Attributes<'a> = &'a [(&'a str, AttributeValue<'a>)];
 
-/// The value of an attribute.
 pub(super) enum AttributeValue<'a> {
     Int(i64),
     Ints(&'a [usize]),
 }
 
-/// A graph under construction.
 pub(super) struct GraphBuilder {
     precision: Precision,
     /// The network's tensors in the order of their ids, which start at 1.
@@ -117,7 +114,6 @@ impl GraphBuilder {
         Value(name.into())
     }
 
-    /// The graph's message, without inputs, outputs and texts.
     pub(super) fn finish(self) -> GraphProto {
         GraphProto {
             node: self.nodes,

@@ -93,7 +93,6 @@ impl Bundle {
         })
     }
 
-    /// The file's message.
     fn onnx(&self, precision: Precision) -> Result<ModelProto, BundleError> {
         let bundle = self.rounded(precision)?;
         let mut graph = GraphBuilder::new(precision, bundle.meta.model.weight_specs());
@@ -131,7 +130,6 @@ impl Bundle {
     }
 }
 
-/// Refuses a network that is too large for one file.
 fn check_size(config: &ModelConfig, precision: Precision) -> Result<(), BundleError> {
     let bytes_per_value = match precision {
         Precision::F32 => 4,

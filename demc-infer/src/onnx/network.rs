@@ -20,7 +20,6 @@ use super::{COLOR, FEATURES, OUTPUT};
 use crate::Precision;
 
 impl GraphBuilder {
-    /// Adds everything from the inputs to the output, both in linear HDR.
     pub(super) fn denoise(&mut self, model: &Denoiser, normalizer: &Normalizer) {
         let modulation = self.modulation(normalizer);
         let color_gamma = self.color_gamma(normalizer.gamma, modulation.as_ref());

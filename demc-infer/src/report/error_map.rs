@@ -8,7 +8,6 @@ use super::codec::{Pixels, reduced};
 pub const SCALE: [f32; 2] = [1e-3, 1e1];
 /// Longest side of an error map in pixels; larger maps show means of blocks.
 const LONGEST: usize = 640;
-/// Side of a patch in pixels.
 const PATCH: usize = 48;
 
 pub struct ErrorMap {

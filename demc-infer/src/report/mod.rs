@@ -125,7 +125,6 @@ impl ReportPage {
     }
 }
 
-/// Scores by method.
 fn by_name(methods: &[(&str, &crate::Score)]) -> Result<serde_json::Value, serde_json::Error> {
     let scores = methods.iter().map(|(name, score)| {
         let score = serde_json::to_value(score)?;

@@ -35,7 +35,6 @@ pub struct SceneImages<'a> {
     pub baselines: &'a [(&'a str, &'a [f32])],
 }
 
-/// `data:` URLs by name.
 type Urls = BTreeMap<String, String>;
 
 /// The pictures that the page decodes when the scene is selected.
@@ -73,7 +72,6 @@ pub struct EncodedScene {
 }
 
 impl SceneImages<'_> {
-    /// Every image except the reference, by name.
     fn candidates(&self) -> Vec<(&str, &[f32])> {
         let first = [("noisy", self.frame.color.as_slice())];
         let last = [("denoised", self.denoised)];
@@ -174,7 +172,6 @@ impl SceneImages<'_> {
 }
 
 impl Inset {
-    /// Bytes of its pictures before base64.
     fn bytes(&self) -> usize {
         let urls = self.pictures.values().chain(self.errors.values());
         urls.map(|url| url.len() * 3 / 4).sum()

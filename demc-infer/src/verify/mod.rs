@@ -20,7 +20,6 @@ pub const TOLERANCE: f32 = 1e-4;
 pub const SIZES: [[usize; 3]; 4] = [[1, 32, 32], [1, 96, 160], [2, 224, 32], [1, 256, 256]];
 /// Epsilon of RelMSE (Eq. 5).
 const RELMSE_EPSILON: f32 = 0.001;
-/// Seed of the frames.
 const SEED: u64 = 20190101;
 /// Exit code of the script for a missing package.
 const NO_PACKAGE: i32 = 3;
@@ -67,7 +66,6 @@ pub struct Deviation {
 }
 
 impl Deviation {
-    /// Compares two batches of this size.
     fn of(size: [usize; 3], found: &[f32], expected: &[f32]) -> Self {
         let largest = expected.iter().fold(0.0f32, |m, x| m.max(x.abs()));
         let worst = |relative: &dyn Fn(f32, f32) -> f32| {
@@ -106,33 +104,27 @@ pub struct Verification {
 /// Why a file cannot be verified.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
+#[allow(missing_docs, reason = "the messages explain the fields")]
 pub enum VerifyError {
     /// The interpreter does not start.
     #[error("cannot run {python}; --python or DEMC_PYTHON names another interpreter")]
     Python {
-        /// The interpreter.
         python: PathBuf,
-        /// The operating system's error.
         source: std::io::Error,
     },
     /// The interpreter lacks a package.
     #[error("{0} lacks a package (install with: {0} -m pip install {packages}): {detail}", python.display())]
     Packages {
-        /// The interpreter.
         python: PathBuf,
         /// The packages for `pip install`.
         packages: &'static str,
-        /// The import error.
         detail: String,
     },
     /// The runtime cannot run the file.
     #[error("{} in {}: {detail}", file.display(), python.display())]
     Run {
-        /// The interpreter.
         python: PathBuf,
-        /// The file.
         file: PathBuf,
-        /// The last line of its output.
         detail: String,
     },
     /// A temporary file for the frames fails.

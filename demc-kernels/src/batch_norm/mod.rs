@@ -260,7 +260,6 @@ impl Rows {
     }
 }
 
-/// Mean and biased variance of each channel.
 fn statistics(isa: Isa, x: &[f32], mean: &mut [f32], variance: &mut [f32]) {
     let channels = mean.len();
     let rows = Rows::new(x.len(), channels);

@@ -3,7 +3,6 @@
 
 use crate::simd::{Leaf, Simd};
 
-/// Sums the columns of a row by channel.
 #[inline(always)]
 fn by_channel(columns: &[f32], channels: usize) -> Vec<f64> {
     let mut sums = vec![0.0; channels];
@@ -103,7 +102,6 @@ impl Leaf for Normalize<'_> {
     }
 }
 
-/// `dy` behind the gate of a ReLU with output `y`.
 #[inline(always)]
 fn gate(dy: f32, y: f32) -> f32 {
     if y > 0.0 { dy } else { 0.0 }

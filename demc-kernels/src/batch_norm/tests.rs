@@ -31,7 +31,6 @@ struct Case {
     dy: Vec<f32>,
 }
 
-/// Channels with different means, spreads and weights.
 fn case(pixels: usize, channels: usize) -> Case {
     let by_channel = |seed| pattern(channels, seed);
     let (center, spread) = (by_channel(1), by_channel(2));

@@ -312,7 +312,6 @@ pub fn backward(
     }
 }
 
-/// First input channel and channel count of each map.
 fn widths(grid: Grid, xs: &[&[f32]]) -> Vec<(usize, usize)> {
     let mut first = 0;
     xs.iter()

@@ -79,7 +79,6 @@ pub struct PreparedConvolution<'a> {
     outputs: usize,
 }
 
-/// Weights in the form that the kernel for their channels reads.
 enum PreparedWeights<'a> {
     Thin(&'a [f32]),
     F2(winograd::WinogradWeights),
@@ -233,7 +232,6 @@ pub fn backward(
     }
 }
 
-/// Checks all lengths and returns the input and output channels.
 fn check(grid: Grid, x: usize, weight: usize, outputs: usize, y: usize) -> (usize, usize) {
     let inputs = grid.channels(x);
     assert_eq!(

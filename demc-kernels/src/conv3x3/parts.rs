@@ -33,7 +33,6 @@ impl Axes {
         }
     }
 
-    /// Index of the weight from `input` to `output` at `tap`.
     pub(super) fn place(self, input: usize, output: usize, tap: usize) -> usize {
         let tap = if self.flipped { 8 - tap } else { tap };
         input * self.input_step + output * self.output_step + tap
@@ -48,7 +47,6 @@ pub(super) struct GatedMap<'a> {
     pub(super) channels: usize,
 }
 
-/// Bias and ReLU, applied to the result of a convolution.
 #[derive(Clone, Copy)]
 pub(super) struct BiasRelu<'a> {
     pub(super) bias: Option<&'a [f32]>,
@@ -56,7 +54,6 @@ pub(super) struct BiasRelu<'a> {
 }
 
 impl BiasRelu<'_> {
-    /// The bias of `n` channels from `channel`.
     #[inline(always)]
     pub(super) unsafe fn bias<S: Simd>(&self, channel: usize, n: usize) -> S::V {
         // SAFETY: `n` values are there; the caller has the path of `S`.

@@ -7,11 +7,9 @@ use crate::rows::{self, BLOCK, Copy, copy, whole};
 use crate::scratch::Scratch;
 use crate::{Grid, Isa};
 
-/// The cells of a grid of inputs.
 #[derive(Clone, Copy)]
 pub(super) struct Cells {
     pub(super) grid: Grid,
-    /// Cells in a row.
     pub(super) across: usize,
 }
 
@@ -23,12 +21,10 @@ impl Cells {
         }
     }
 
-    /// Cells in an image.
     pub(super) fn of_image(self) -> usize {
         (self.grid.height + 1) * self.across
     }
 
-    /// Cells in all images.
     pub(super) fn count(self) -> usize {
         self.grid.batch * self.of_image()
     }

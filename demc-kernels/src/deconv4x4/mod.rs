@@ -323,7 +323,6 @@ pub fn backward(
         });
 }
 
-/// Checks all lengths and returns the input and output channels.
 fn check(grid: Grid, x: usize, weight: usize, outputs: usize, y: usize) -> (usize, usize) {
     let inputs = grid.channels(x);
     assert_eq!(

@@ -34,7 +34,6 @@ const MOST_KEPT: usize = 512;
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Recycler;
 
-/// A range of free memory.
 #[derive(Clone, Copy)]
 struct FreeBlock {
     address: usize,
@@ -45,7 +44,6 @@ struct FreeBlock {
 struct FreeList {
     blocks: [FreeBlock; MOST_KEPT],
     count: usize,
-    /// Bytes of all blocks.
     bytes: usize,
     /// Bytes in use, and their maximum so far.
     used: usize,
@@ -141,7 +139,6 @@ fn kept() -> std::sync::MutexGuard<'static, FreeList> {
     KEPT.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
 }
 
-/// Size of the block for an allocation, in bytes; `None` if the system's allocator serves it.
 fn block_size(size: usize, align: usize) -> Option<usize> {
     let large = cfg!(all(target_os = "linux", not(miri))) && size >= GRAIN && align <= GRAIN;
     large
@@ -181,7 +178,6 @@ unsafe fn release(pointer: *mut u8, size: usize) {
     give_back(rejected);
 }
 
-/// Returns a block that was not kept, and all surplus blocks, to the system.
 fn give_back(mut surplus: Option<FreeBlock>) {
     while let Some(FreeBlock { address, size }) = surplus.take().or_else(|| kept().surplus()) {
         // SAFETY: joined blocks are whole mapped pages. They were free, so nothing uses them.
@@ -189,7 +185,6 @@ fn give_back(mut surplus: Option<FreeBlock>) {
     }
 }
 
-/// Memory from the operating system.
 #[cfg(all(target_os = "linux", not(miri)))]
 mod system {
     use super::LARGE;

@@ -89,7 +89,6 @@ unsafe fn part<S: Simd>(p: *const f32, n: usize) -> S::V {
     }
 }
 
-/// Runs a [struct@Copy].
 pub(crate) fn copy(isa: Isa, copy: Copy) {
     // SAFETY: the leaf checks its lengths.
     unsafe { run(isa, copy) }

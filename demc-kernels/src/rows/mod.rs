@@ -108,7 +108,6 @@ impl Packed {
         }
     }
 
-    /// Number of columns.
     pub(crate) fn columns(&self) -> usize {
         self.columns
     }

@@ -19,15 +19,11 @@ pub(super) fn bands(height: usize, band: usize) -> impl Iterator<Item = Range<us
     starts.map(move |start| start..(start + band).min(height))
 }
 
-/// Consecutive rows of one image's map. Only these rows are in memory.
 pub(super) struct RowWindow {
-    /// Rows of the whole map.
     height: usize,
     width: usize,
     channels: usize,
-    /// The first row in memory.
     first: usize,
-    /// Number of rows in memory.
     rows: usize,
     values: Vec<f32>,
 }
@@ -45,23 +41,19 @@ impl RowWindow {
         }
     }
 
-    /// Returns to the top, for the next image.
     pub(super) fn restart(&mut self) {
         (self.first, self.rows) = (0, 0);
         self.values = Vec::new();
     }
 
-    /// The row after the last one in memory.
     fn end(&self) -> usize {
         self.first + self.rows
     }
 
-    /// The rows in memory.
     pub(super) fn range(&self) -> Range<usize> {
         self.first..self.end()
     }
 
-    /// Appends `rows`, which the caller writes.
     pub(super) fn push(&mut self, rows: usize) -> &mut [f32] {
         let row = self.width * self.channels;
         let held = self.rows * row;
@@ -72,19 +64,16 @@ impl RowWindow {
         &mut self.values[held..]
     }
 
-    /// The values of the last `rows`.
     pub(super) fn last(&self, rows: usize) -> &[f32] {
         let row = self.width * self.channels;
         &self.values[(self.rows - rows) * row..self.rows * row]
     }
 
-    /// The values of the last `rows`, to modify.
     pub(super) fn last_mut(&mut self, rows: usize) -> &mut [f32] {
         let row = self.width * self.channels;
         &mut self.values[(self.rows - rows) * row..self.rows * row]
     }
 
-    /// All rows in memory and their grid.
     pub(super) fn all(&self) -> (Grid, &[f32]) {
         let grid = Grid {
             batch: 1,
@@ -94,7 +83,6 @@ impl RowWindow {
         (grid, self.last(self.rows))
     }
 
-    /// Frees the rows above `row`.
     pub(super) fn free_above(&mut self, row: usize) {
         let freed = row.clamp(self.first, self.end()) - self.first;
         if freed == 0 {
@@ -107,7 +95,6 @@ impl RowWindow {
         (self.first, self.rows) = (self.first + freed, self.rows - freed);
     }
 
-    /// Frees all rows.
     pub(super) fn free_all(&mut self) {
         self.free_above(self.end());
     }
@@ -127,12 +114,10 @@ fn copy(source: &[f32], target: &mut [f32]) {
 pub(super) struct BandedConv<'a> {
     conv: PreparedConvolution<'a>,
     input: RowWindow,
-    /// Number of rows computed so far.
     made: usize,
 }
 
 impl<'a> BandedConv<'a> {
-    /// A convolution of a map on `grid`.
     pub(super) fn new(conv: PreparedConvolution<'a>, grid: Grid) -> Self {
         let input = RowWindow::new(grid, conv.inputs());
         BandedConv {
@@ -156,7 +141,6 @@ impl<'a> BandedConv<'a> {
         self.made..end.max(self.made)
     }
 
-    /// Computes `rows` and keeps the input rows that the next ones need.
     fn compute(&mut self, rows: &Range<usize>, y: &mut [f32]) {
         let (grid, x) = self.input.all();
         self.conv.forward(grid, x, rows.start - self.input.first, y);
@@ -165,21 +149,17 @@ impl<'a> BandedConv<'a> {
     }
 }
 
-/// A sequence of convolutions.
 pub(super) struct ConvChain<'a> {
     pub(super) convs: Vec<BandedConv<'a>>,
-    /// The rows of the last convolution's output.
     pub(super) output: RowWindow,
 }
 
 impl ConvChain<'_> {
-    /// Returns to the top, for the next image.
     pub(super) fn restart(&mut self) {
         self.convs.iter_mut().for_each(BandedConv::restart);
         self.output.restart();
     }
 
-    /// The input rows of the first convolution.
     pub(super) fn input(&mut self) -> &mut RowWindow {
         let first = self.convs.first_mut();
         &mut first.expect("a chain of at least one convolution").input

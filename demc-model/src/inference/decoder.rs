@@ -13,7 +13,6 @@ use super::{FeatureMaps, InferencePass};
 use crate::decoder::DecoderLevel;
 
 impl InferencePass<'_> {
-    /// The output of a level. `sum` is the skips' share of its fusion.
     pub(super) fn decode_level(
         &self,
         level: &DecoderLevel,
@@ -55,7 +54,6 @@ impl InferencePass<'_> {
     }
 }
 
-/// The deconvolution and the skip fusion of a level.
 pub(super) fn folded_level(level: &DecoderLevel) -> [FoldedConv; 2] {
     [
         FoldedConv::deconv(&level.deconv, level.norm.as_ref()),
@@ -63,7 +61,6 @@ pub(super) fn folded_level(level: &DecoderLevel) -> [FoldedConv; 2] {
     ]
 }
 
-/// A level of the decoder with prepared weights.
 pub(super) struct PreparedLevel<'a> {
     isa: Isa,
     deconv: PreparedDeconvolution<'a>,

@@ -155,7 +155,6 @@ impl InferencePass<'_> {
         }
     }
 
-    /// The convolutions of some levels of an encoder.
     pub(super) fn folded_levels(
         &self,
         encoder: usize,
@@ -207,7 +206,6 @@ impl InferencePass<'_> {
             .then(|| FeatureMaps::new(grid.halved(), channels))
     }
 
-    /// A chain of convolutions, each with a ReLU, for bands of an image on `grid`.
     pub(super) fn chain<'a>(&self, convs: &'a [FoldedConv], grid: Grid) -> ConvChain<'a> {
         let (isa, tile) = (self.isa, self.tile);
         let banded = convs.iter().map(|conv| {
@@ -221,20 +219,17 @@ impl InferencePass<'_> {
         }
     }
 
-    /// The skip fusion of a level, counted from the full resolution down.
     pub(super) fn skip_fusion(&self, level: usize) -> FoldedConv {
         FoldedConv::conv(&self.model.decoder.levels[LEVELS - 1 - level].fuse, None)
     }
 }
 
-/// A level of an encoder for bands of maps.
 pub(super) struct BandedLevel<'a> {
     pub(super) chain: ConvChain<'a>,
     /// Number of convolutions before the skip.
     skip_after: usize,
 }
 
-/// The convolution of a block with its normalisation folded in.
 pub(super) fn folded_block(block: &ConvBlock) -> FoldedConv {
     FoldedConv::conv(&block.conv, block.norm.as_ref())
 }

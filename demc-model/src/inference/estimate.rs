@@ -10,7 +10,6 @@ use crate::config::{
 };
 use crate::ops::Ops;
 
-/// Bytes per value.
 const VALUE: usize = size_of::<f32>();
 
 /// Values of a transformed Winograd tile, F(4x4, 3x3).
@@ -74,11 +73,9 @@ pub fn reusable_bytes() -> u64 {
     memory::kept_bytes() as u64
 }
 
-/// The sizes of a pass through the network, in values.
 struct PeakEstimate<'a> {
     config: &'a ModelConfig,
     plan: BandPlan,
-    /// The image.
     grid: Grid,
 }
 
@@ -91,12 +88,10 @@ impl PeakEstimate<'_> {
         self.config.level_channels()[level]
     }
 
-    /// The output of a convolution of a level.
     fn map(&self, level: usize) -> usize {
         self.grid_of(level).pixels() * self.channels(level)
     }
 
-    /// The input of a level.
     fn input(&self, level: usize) -> usize {
         match level {
             0 => self.grid.pixels() * self.first_input(),
@@ -115,7 +110,6 @@ impl PeakEstimate<'_> {
         self.config.variant.spec().encoders.len()
     }
 
-    /// The planar images.
     fn images(&self) -> usize {
         self.grid.pixels() * (COLOR_CHANNELS + FEATURE_CHANNELS)
     }
@@ -176,12 +170,10 @@ impl PeakEstimate<'_> {
         TILE_VALUES * outputs * (inputs + others * outputs)
     }
 
-    /// The prepared weights of the largest convolution of a level.
     fn largest_weights(&self, level: usize) -> usize {
         TILE_VALUES * self.channels(level) * self.channels(level)
     }
 
-    /// Rows of a map of a level.
     fn rows(&self, level: usize, rows: usize) -> usize {
         let Grid { height, width, .. } = self.grid_of(level);
         rows.min(height) * width * self.channels(level)
@@ -258,7 +250,6 @@ impl PeakEstimate<'_> {
         self.skip_sources() + most.max(output + last)
     }
 
-    /// The map below a level of the decoder.
     fn below(&self, level: usize) -> usize {
         match level + 1 {
             LEVELS => self.map(LEVELS - 1) / 4,

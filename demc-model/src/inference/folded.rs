@@ -15,7 +15,6 @@ pub struct FoldedConv {
     bias: HostValues,
 }
 
-/// Values on the host.
 enum HostValues {
     /// The values of a parameter.
     Shared(FlexTensor),

@@ -28,7 +28,6 @@ pub(super) struct SkipSources {
     detail: Option<FeatureMaps>,
 }
 
-/// The result of the encoders' upper levels.
 pub(super) struct UpperLevels {
     /// The skips' share of the second level's fusion.
     pub(super) sum: FeatureMaps,

@@ -52,7 +52,6 @@ const MOST_ROWS: usize = 256;
 /// The rows of a band are a multiple of this: of a tile, at the level below, too.
 const BAND_STEP: usize = 2 * TILE_ROWS;
 
-/// See [`Denoiser::forward`], which has checked the shapes.
 pub(crate) fn forward(
     model: &Denoiser,
     color_gamma: Tensor<4>,
@@ -83,13 +82,11 @@ fn forward_with(
     Tensor::from_primitive::<Flex>(FlexTensor::from_data(TensorData::new(out, shape)))
 }
 
-/// The size of the bands of an image.
 #[derive(Clone, Copy)]
 struct BandPlan {
     /// Rows of a band at every level. With the paper's levels, where channels double and the width
     /// halves, a row has the same number of values at every level.
     band: usize,
-    /// Threads that share the work on a band.
     threads: usize,
 }
 
@@ -110,7 +107,6 @@ impl BandPlan {
     }
 }
 
-/// One pass through the network.
 struct InferencePass<'a> {
     isa: Isa,
     tile: Tile,
@@ -118,7 +114,6 @@ struct InferencePass<'a> {
     model: &'a Denoiser,
 }
 
-/// The result of the encoders.
 struct EncodedImages {
     /// The skips' share of each level's fusion, from the full resolution down; without the first
     /// level if `sources` holds its inputs.
@@ -130,7 +125,6 @@ struct EncodedImages {
 }
 
 impl InferencePass<'_> {
-    /// Computes all levels of all encoders.
     fn encode(&self, images: InputImages) -> EncodedImages {
         let (mut sums, mut sources) = (Vec::with_capacity(LEVELS), None);
         let (first, mut inputs) = match self.plan.is_banded(images.grid) {
@@ -158,7 +152,6 @@ impl InferencePass<'_> {
         }
     }
 
-    /// Planar images `[B, 3, H, W]` from the result of the encoders.
     fn decode(&self, encoded: EncodedImages) -> Vec<f32> {
         let EncodedImages {
             sums,
@@ -192,7 +185,6 @@ impl InferencePass<'_> {
     }
 }
 
-/// Feature maps of a batch, channels last.
 struct FeatureMaps {
     grid: Grid,
     values: Vec<f32>,
@@ -220,7 +212,6 @@ impl FeatureMaps {
         }
     }
 
-    /// The values of some rows of an image.
     fn rows(&self, image: usize, rows: Range<usize>) -> &[f32] {
         &self.values[self.range(image, rows)]
     }

@@ -29,7 +29,6 @@ fn initialised(config: ModelConfig) -> Denoiser {
     config.init(&mut rng, [0.5; 3], &Device::flex())
 }
 
-/// Batch, height, width.
 const SIZES: [[usize; 3]; 3] = [[1, 32, 32], [2, 96, 64], [1, 160, 32]];
 
 fn images([batch, height, width]: [usize; 3]) -> [Tensor<4>; 2] {
@@ -43,7 +42,6 @@ fn images([batch, height, width]: [usize; 3]) -> [Tensor<4>; 2] {
     })
 }
 
-/// A plan with bands of `band` rows.
 fn plan(band: usize) -> BandPlan {
     BandPlan {
         band,

@@ -1,10 +1,8 @@
 //! The colour spaces of FLIP: sRGB, linear RGB, XYZ, the opponent space YCxCz and Hunt-adjusted
 //! L*a*b*. D65, single precision, constants of Andersson et al. 2020.
 
-/// The colour of a pixel.
 pub(super) type Color = [f32; 3];
 
-/// Matrix from linear RGB to XYZ.
 const XYZ_FROM_RGB: [[f32; 3]; 3] = [
     [
         (10135552.0_f64 / 24577794.0) as f32,
@@ -22,16 +20,13 @@ const XYZ_FROM_RGB: [[f32; 3]; 3] = [
         (70074185.0_f64 / 73733382.0) as f32,
     ],
 ];
-/// Matrix from XYZ to linear RGB.
 const RGB_FROM_XYZ: [[f32; 3]; 3] = [
     [3.241_003_3, -1.537_398_9, -0.498_615_9],
     [-0.969_224_3, 1.875_93, 0.041_554_22],
     [0.055_639_4, -0.204_011_2, 1.057_149],
 ];
-/// XYZ of white.
 const WHITE: Color = [0.950_428_54, 1.0, 1.088_900_4];
 
-/// Linear RGB of sRGB.
 pub(super) fn linear_from_srgb(x: f32) -> f32 {
     if x > 0.04045 {
         ((x + 0.055) / 1.055).powf(2.4)

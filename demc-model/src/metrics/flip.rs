@@ -69,16 +69,12 @@ pub fn flip(candidate: &Image, reference: &Image) -> f64 {
     errors.iter().map(|e| f64::from(*e)).sum::<f64>() / errors.len() as f64
 }
 
-/// The filtered image that FLIP compares.
 pub(super) struct Appearance {
-    /// Filtered colours.
     lab: Vec<Color>,
-    /// Strength of edges and of points.
     features: Vec<[f32; 2]>,
 }
 
 impl Appearance {
-    /// The appearance of planar display values in 0 to 1.
     pub(super) fn new(display: &[f64], width: usize) -> Self {
         let pixels = display.len() / 3;
         let mut planes = display.chunks(pixels);

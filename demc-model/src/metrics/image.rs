@@ -74,7 +74,6 @@ impl<'a> Image<'a> {
         self.appearance();
     }
 
-    /// Number of pixels.
     pub(super) fn pixels(&self) -> usize {
         self.height * self.width
     }
@@ -88,7 +87,6 @@ impl<'a> Image<'a> {
         })
     }
 
-    /// The appearance that FLIP compares.
     pub(super) fn appearance(&self) -> &Appearance {
         once(&self.appearance, || {
             Appearance::new(self.display(), self.width)

@@ -37,7 +37,6 @@ impl Activation {
 #[derive(Clone, Debug)]
 pub struct Maps {
     tensor: Tensor<4>,
-    /// The operations that run on the tensor's device.
     ops: Ops,
 }
 
@@ -188,7 +187,6 @@ impl Maps {
     }
 }
 
-/// The tensors of `parts` and the operations that run on them.
 fn split(parts: Vec<Maps>) -> (Vec<Tensor<4>>, Ops) {
     let ops = parts.first().expect("at least one part").ops;
     assert!(

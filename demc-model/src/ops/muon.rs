@@ -95,7 +95,6 @@ fn orthogonal(x: Tensor<2>, length: f64) -> Tensor<2> {
     product.matmul(x)
 }
 
-/// The arrangement of a kernel's values in its matrix.
 #[derive(Clone, Copy)]
 struct MatrixLayout {
     rows: usize,

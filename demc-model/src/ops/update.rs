@@ -165,7 +165,6 @@ pub fn moving_average<const D: usize>(
     }
 }
 
-/// The operations that a backend needs to update weights by the kernels.
 #[backend_extension(Flex)]
 trait UpdateOps: Backend {
     /// Weight and moments after step number `step`, counted from 1.
@@ -177,7 +176,6 @@ trait UpdateOps: Backend {
         constants: demc_kernels::adam::Adam,
         step: u64,
     ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
-    /// The sum of squares in float64.
     fn sum_of_squares(x: FloatTensor<Self>) -> f64;
     /// The average, moved by `share` of its distance from `live`.
     fn moving_average(

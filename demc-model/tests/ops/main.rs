@@ -20,7 +20,6 @@ const BATCHES: [usize; 2] = [1, 3];
 const CHANNELS: [usize; 3] = [1, 3, 17];
 const ACTIVATIONS: [Activation; 2] = [Activation::None, Activation::Relu];
 
-/// The results of one operation: the name and the values of each tensor.
 type NamedTensors = Vec<(String, Vec<f32>)>;
 
 /// Runs `op` on inputs of `shapes` and sums its output with random weights. Returns the output and
@@ -66,7 +65,6 @@ fn gradient<const D: usize>(
     (format!("gradient of {name}"), host(gradient))
 }
 
-/// Asserts that both implementations give the same results.
 fn same(what: &str, run: impl Fn(Ops) -> NamedTensors) {
     let [kernels, burn] = Ops::ALL.map(run);
     assert_eq!(kernels.len(), burn.len());

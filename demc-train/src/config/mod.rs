@@ -53,13 +53,12 @@ pub struct Config {
 
 /// Why a configuration cannot be used.
 #[derive(Debug, Error)]
+#[allow(missing_docs, reason = "the messages explain the fields")]
 pub enum ConfigError {
     /// The file cannot be read.
     #[error("{}", path.display())]
     Read {
-        /// The file.
         path: PathBuf,
-        /// The system's error.
         source: std::io::Error,
     },
     /// The file is not TOML, holds unknown keys, or a value has the wrong type.
@@ -68,9 +67,7 @@ pub enum ConfigError {
     /// All values out of range.
     #[error("{}: {}", path.display(), problems.join("; "))]
     Values {
-        /// The file.
         path: PathBuf,
-        /// One line each.
         problems: Vec<String>,
     },
 }
@@ -250,7 +247,6 @@ impl Config {
     }
 }
 
-/// The text of a file, up to a limit: the file may be an endless pipe.
 fn read_text(path: &Path) -> io::Result<String> {
     let mut text = String::new();
     File::open(path)?

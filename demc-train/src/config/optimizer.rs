@@ -102,7 +102,6 @@ impl OptimizerConfig {
         problems.into_lines()
     }
 
-    /// Fills in what depends on other keys, for the saved configuration.
     pub(super) fn resolve(&mut self) {
         self.muon_max_rows = self.muon_rows();
     }

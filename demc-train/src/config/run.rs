@@ -19,7 +19,6 @@ const CHECKPOINT_MINUTES: f64 = 15.0;
 const MAX_MINUTES: f64 = 525_600.0;
 /// Ours: if one checkpoint is damaged, the other is intact.
 const KEEP: usize = 2;
-/// Seconds per minute.
 const MINUTE: f64 = 60.0;
 
 /// The `[run]` table.

@@ -128,7 +128,6 @@ fn check_keys(
     }
 }
 
-/// Refuses keys of the first edition and unknown keys.
 fn check_key(path: &str, is_boolean: bool, keys: &BTreeSet<String>) -> Result<(), String> {
     if let Some(refusal) = first_edition::refusal(path, is_boolean) {
         return Err(refusal);
@@ -181,7 +180,6 @@ fn suggestion(path: &str, keys: &BTreeSet<String>) -> String {
     }
 }
 
-/// The known name that is most similar to `name`, if any is similar enough.
 fn nearest<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     let similarities = known.map(|known| (strsim::jaro_winkler(name, known), known));
     let (similarity, nearest) = similarities.max_by(|a, b| a.0.total_cmp(&b.0))?;
@@ -196,7 +194,6 @@ struct Edit<'a> {
     value: Option<Value>,
 }
 
-/// Parses an edit and checks its key.
 fn edit<'a>(set: &'a str, keys: &BTreeSet<String>) -> Result<Edit<'a>, String> {
     let (path, value) = set
         .split_once('=')
@@ -231,7 +228,6 @@ impl Edit<'_> {
     }
 }
 
-/// A message of the TOML parser without its line breaks.
 pub(crate) fn one_line(message: &str) -> String {
     message.split_whitespace().collect::<Vec<_>>().join(" ")
 }

@@ -7,7 +7,6 @@ fn parsed(text: &str, sets: &[&str]) -> Result<Config, String> {
     Config::parse(Path::new("run.toml"), text, &sets).map_err(|error| error.to_string())
 }
 
-/// A file of the repository.
 fn repository(path: &str) -> String {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path);
     std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))

@@ -96,7 +96,6 @@ impl Recorder {
     }
 }
 
-/// Patches per second of the steps, without validations and checkpoints.
 struct Pace {
     patches_per_step: u64,
     steps: u64,

@@ -26,13 +26,11 @@ use crate::run::checkpoint::store::CheckpointStore;
 use crate::run::data::RunData;
 use crate::run::initial::InitialWeights;
 
-/// The resolved configuration.
 const CONFIG: &str = "config.toml";
 /// The record of versions, device and data.
 const RUN: &str = "run.json";
 /// The manifest that pins the version of Burn; Burn itself exports none.
 const MANIFEST: &str = include_str!("../../../Cargo.toml");
-/// The log of metrics.
 const METRICS: &str = "metrics.jsonl";
 /// The channel layout, if it is not a preset.
 const LAYOUT: &str = "layout.toml";
@@ -53,12 +51,9 @@ pub struct RunDir {
     lock: Option<File>,
 }
 
-/// The contents of `run.json`.
 #[derive(Debug, Serialize, Deserialize)]
 struct RunRecord {
-    /// Version of this program.
     demc: String,
-    /// Version of Burn.
     burn: String,
     /// Device of the first start.
     device: String,
@@ -67,7 +62,6 @@ struct RunRecord {
     operations: String,
     /// Number of trainable parameters.
     parameters: u64,
-    /// Patches per epoch.
     patches: usize,
     /// Names of the scenes of each split.
     scenes: SceneNames,
@@ -294,7 +288,6 @@ impl RunDir {
     }
 }
 
-/// The pinned version of Burn.
 fn burn_version() -> String {
     let manifest: toml::Table = MANIFEST.parse().expect("the manifest that Cargo read");
     let pinned = manifest["workspace"]["dependencies"]["burn"]["version"].as_str();

@@ -273,7 +273,6 @@ impl TrainingRun {
         )
     }
 
-    /// Writes a checkpoint.
     fn save(&self) -> anyhow::Result<()> {
         let bundle = self.bundle(self.trainer.model().valid());
         let average = self.trainer.average();
@@ -366,7 +365,6 @@ impl TrainingRun {
         text
     }
 
-    /// A network of this run at its present step, with statistics and layout.
     fn bundle(&self, model: Denoiser) -> Bundle {
         let meta = self.data.meta(self.config.model, self.state.step);
         Bundle { meta, model }
@@ -417,7 +415,6 @@ impl SessionClock {
         }
     }
 
-    /// Seconds of the run so far.
     fn elapsed(&self) -> f64 {
         self.before + self.started.elapsed().as_secs_f64()
     }

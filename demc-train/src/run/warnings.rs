@@ -32,7 +32,6 @@ const ZERO_OUTPUT: f64 = 0.25;
 /// and recovers.
 const DORMANT: f64 = 0.3;
 
-/// The subject of a warning.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 enum WarningTopic {
@@ -50,19 +49,14 @@ enum WarningTopic {
 pub struct RunMonitor {
     /// Steps and sum of the losses of the current window.
     window: (u64, f64),
-    /// Number of complete windows.
     windows: u64,
-    /// Mean loss of the first window.
     first: f64,
-    /// Smallest mean loss of a window.
     best: f64,
     /// Sum of the losses of each scene in the current epoch.
     scenes: Vec<f64>,
     /// Patches in the current epoch.
     patches: u64,
-    /// Number of complete epochs.
     passes: u64,
-    /// Warnings that were given.
     said: Vec<WarningTopic>,
 }
 
@@ -215,7 +209,6 @@ mod tests {
         (0..count).map(|i| format!("scene-{i}")).collect()
     }
 
-    /// The warnings of a run with these losses, one scene per step in turn.
     fn run(losses: impl Iterator<Item = f64>, scenes: usize) -> Vec<String> {
         let names = names(scenes);
         let facts = LoopFacts {

@@ -56,7 +56,6 @@ enum WeightState {
 }
 
 impl WeightState {
-    /// The tensors with the suffixes of their names in a checkpoint.
     fn tensors(&self) -> Vec<(&'static str, &Tensor<1>)> {
         match self {
             WeightState::Adam(AdamMoments { first, second }) => {
@@ -230,7 +229,6 @@ impl Optimizer {
     }
 }
 
-/// A tensor on the host.
 fn values(tensor: &Tensor<1>) -> Vec<f32> {
     let data = tensor.to_data();
     data.try_to_vec().expect("moments are float32")

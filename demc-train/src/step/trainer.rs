@@ -197,7 +197,6 @@ impl Trainer {
         losses.sum::<f64>() / count
     }
 
-    /// Clips a gradient of norm `norm` and updates weights and average.
     fn update(&mut self, lr: f64, mut grads: GradientsParams, norm: f64) {
         if let Some(limit) = self.max_grad_norm.map(f64::from)
             && norm > limit

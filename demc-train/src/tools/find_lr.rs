@@ -119,7 +119,6 @@ pub fn sweep(
     })
 }
 
-/// The ratios of a sweep so far.
 #[derive(Default)]
 struct SweepRatios {
     points: Vec<SweepPoint>,
@@ -246,7 +245,6 @@ fn rounded(lr: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// A sweep over rates from 1e-6 by factors of 10^(1/10) with these ratios.
     fn sweep(ratios: impl Iterator<Item = f64>) -> Sweep {
         let mut ratios_so_far = SweepRatios::default();
         let mut diverged = false;

@@ -9,7 +9,6 @@ use serde::Deserialize;
 
 use crate::tools::chart::figure::{AxisScale, Figure, LinePanel, Series};
 
-/// The log of a run.
 const METRICS: &str = "metrics.jsonl";
 
 /// Options of the curves.
@@ -22,7 +21,6 @@ pub struct PlotOptions {
     pub linear: bool,
 }
 
-/// The drawn values of a line of `metrics.jsonl`, where non-finite values are `null`.
 #[derive(Clone, Copy, Debug, Deserialize)]
 struct LoggedValues {
     step: u64,
@@ -54,7 +52,6 @@ pub fn plot(runs: &[PathBuf], stem: &Path, options: &PlotOptions) -> anyhow::Res
     Figure::Lines(panels(&named, options)).write(stem)
 }
 
-/// The lines of a log.
 fn log(path: &Path) -> anyhow::Result<Vec<LoggedValues>> {
     let text = fs::read_to_string(path)
         .with_context(|| format!("{}: cannot read the log of a run", path.display()))?;
@@ -130,7 +127,6 @@ fn panel(title: &str, y_label: &str, y: AxisScale, series: Vec<Series>) -> LineP
     }
 }
 
-/// A value over the steps; NaN if a line has none.
 fn curve(
     name: &str,
     color: usize,

@@ -17,7 +17,6 @@ use crate::fixture::{
 use crate::tensors::{Tolerance, assert_close};
 use crate::{GRADIENT, OUTPUT};
 
-/// A function that runs one block of a network.
 type BlockForward = fn(&Denoiser, Vec<Maps>) -> Vec<Maps>;
 
 #[test]
@@ -112,7 +111,6 @@ fn encode(model: &Denoiser, [encoder, level]: [usize; 2], inputs: Vec<Maps>) -> 
         .collect()
 }
 
-/// Runs `forward` on Burn tensors, with the operations of the network.
 fn run(model: &Denoiser, forward: BlockForward, inputs: Vec<Tensor<4>>) -> Vec<Tensor<4>> {
     let inputs = inputs.into_iter().map(|x| Maps::from_nchw(x, model.ops()));
     let outputs = forward(model, inputs.collect());

@@ -10,7 +10,6 @@ use demc_model::{Denoiser, ModelConfig, Reading, Variant, Weight, Weights};
 
 use crate::tensors::{self, HostTensor};
 
-/// The width of the fixtures' networks.
 const WIDTH: usize = 2;
 
 /// One fixture file. Its tensors have PyTorch's names, after a prefix.

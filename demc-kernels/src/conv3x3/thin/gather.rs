@@ -17,7 +17,6 @@ pub(super) fn neighbour(grid: Grid, row: usize, column: usize, tap: usize) -> Op
     })
 }
 
-/// Row and column of a pixel in its image.
 #[inline(always)]
 fn place(grid: Grid, pixel: usize) -> (usize, usize) {
     (pixel / grid.width % grid.height, pixel % grid.width)
@@ -107,7 +106,6 @@ unsafe fn copy_part<S: Simd>(source: GatedMap, first: usize, target: &mut [f32],
 }
 
 impl GatedMap<'_> {
-    /// See [`Gather`].
     pub(super) fn gather(
         &self,
         isa: Isa,

@@ -30,7 +30,6 @@ use weights::place_step;
 pub(super) use gradient::gradient;
 pub(super) use weights::WinogradWeights;
 
-/// Input transform, products and output transform of some tiles.
 struct TileBlock<'a, const IN: usize> {
     source: GatedMap<'a>,
     weights: &'a WinogradWeights,

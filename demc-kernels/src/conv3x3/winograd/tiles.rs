@@ -7,10 +7,8 @@ use crate::Grid;
 use crate::conv3x3::parts::GatedMap;
 use crate::simd::Simd;
 
-/// The tiles that cover a grid.
 #[derive(Clone, Copy)]
 pub(super) struct WinogradTiles {
-    /// Grid of the output.
     pub(super) grid: Grid,
     /// Grid of the input, with more rows where the output is a band of an image.
     pub(super) input: Grid,

@@ -11,7 +11,6 @@ use crate::product::Panels;
 use crate::scratch::{Scratch, Shared};
 use crate::simd::{Leaf, Simd, WIDEST, run};
 
-/// Weights in the transformed space.
 pub(crate) struct WinogradWeights {
     pub(super) isa: Isa,
     pub(super) depth: usize,
@@ -20,7 +19,6 @@ pub(crate) struct WinogradWeights {
     pub(super) values: Scratch,
 }
 
-/// Transforms some rows of the weights.
 struct TransformWeights<'a, const IN: usize> {
     weight: &'a [f32],
     axes: Axes,
@@ -67,7 +65,6 @@ impl<const IN: usize> Leaf for TransformWeights<'_, IN> {
     }
 }
 
-/// Columns rounded up to whole vectors of `isa`.
 struct Padded(usize);
 
 impl Leaf for Padded {

@@ -188,7 +188,6 @@ pub(super) fn rel_mse_into(
     tensor(losses, [batch])
 }
 
-/// The 1x1 convolution of the concatenation of `parts`.
 pub(super) fn fuse<const P: usize>(
     parts: [FlexTensor; P],
     weight: FlexTensor,

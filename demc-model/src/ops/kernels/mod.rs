@@ -16,7 +16,6 @@ use demc_kernels::Grid;
 
 use super::Activation;
 
-/// The operations that a backend needs to run the kernels.
 #[backend_extension(Flex, Autodiff)]
 pub(super) trait KernelOps: Backend {
     /// `[B, C, H, W]` to `[B, H, W, C]`.
@@ -155,7 +154,6 @@ pub(super) fn batch_norm(x: Tensor<4>, norm: &BatchNorm, activation: Activation)
     ))
 }
 
-/// The normalised maps, and the mean and variance of the batch.
 pub(super) fn batch_norm_train(
     x: Tensor<4>,
     norm: &BatchNorm,
@@ -203,17 +201,14 @@ fn buffer(len: usize) -> Vec<f32> {
     demc_kernels::memory::buffer(len)
 }
 
-/// The tensor with these values.
 fn tensor<const D: usize>(values: Vec<f32>, shape: [usize; D]) -> FlexTensor {
     FlexTensor::from_data(TensorData::new(values, shape))
 }
 
-/// The axes of a tensor.
 fn dims<const D: usize>(tensor: &FlexTensor) -> [usize; D] {
     tensor.layout().shape().dims()
 }
 
-/// The grid and the number of channels of maps `[B, H, W, C]`.
 fn grid(maps: &FlexTensor) -> (Grid, usize) {
     let [batch, height, width, channels] = dims(maps);
     let grid = Grid {
@@ -224,7 +219,6 @@ fn grid(maps: &FlexTensor) -> (Grid, usize) {
     (grid, channels)
 }
 
-/// The tensor of these maps on `grid`.
 fn maps(grid: Grid, values: Vec<f32>) -> FlexTensor {
     let channels = grid.channels(values.len());
     tensor(values, [grid.batch, grid.height, grid.width, channels])

@@ -168,13 +168,11 @@ fn next_name(dir: &Path) -> std::io::Result<String> {
     Ok(format!("{PREFIX}{second:010}.demc.{process}.{files}"))
 }
 
-/// The second in the name of an event file.
 fn second_of(name: &str) -> Option<u64> {
     let (second, _) = name.strip_prefix(PREFIX)?.split_once('.')?;
     second.parse().ok()
 }
 
-/// Seconds since 1970.
 fn wall_time() -> f64 {
     let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
     since.unwrap_or_default().as_secs_f64()

@@ -36,9 +36,7 @@ use store::{CheckpointRetention, CheckpointStore};
 
 /// Version of a checkpoint's files; raised when a meaning changes.
 pub const FORMAT: u32 = 2;
-/// State of the optimizer.
 const OPTIMIZER: &str = "optimizer.safetensors";
-/// State of the training loop.
 const STATE: &str = "state.json";
 
 /// The state of the training loop between two steps.

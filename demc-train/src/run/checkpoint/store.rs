@@ -15,11 +15,9 @@ use demc_data::file::{sync_dir, write_whole};
 use demc_infer::bundle::locate::{CHECKPOINTS, LATEST};
 use sha2::{Digest, Sha256};
 
-/// Checksums of a checkpoint's files, as `sha256sum` prints them.
 const SUMS: &str = "SHA256SUMS";
 /// Suffix of an unfinished checkpoint.
 const UNFINISHED: &str = ".tmp";
-/// Bytes read at a time.
 const PIECE: usize = 1 << 20;
 
 /// Which checkpoints are kept.
@@ -166,7 +164,6 @@ impl CheckpointStore {
     }
 }
 
-/// The step in the name of a checkpoint; `None` for other names.
 fn step_of(name: &str) -> Option<u64> {
     let digits = name.strip_prefix("step-")?;
     let is_name = digits.len() >= 8 && digits.bytes().all(|b| b.is_ascii_digit());
@@ -283,7 +280,6 @@ mod tests {
         every: None,
     };
 
-    /// A run with these checkpoints, of one file each.
     fn run(steps: &[u64], retention: CheckpointRetention) -> (tempfile::TempDir, CheckpointStore) {
         let dir = tempfile::tempdir().unwrap();
         let store = CheckpointStore::new(dir.path());

@@ -5,7 +5,6 @@ use rand::SeedableRng;
 
 const LR: f64 = 1e-3;
 
-/// A network of width 1.
 fn config() -> Config {
     let mut config = Config::default();
     config.model.width = 1;

@@ -57,7 +57,6 @@ pub struct FinishedRun {
     pub seconds: f64,
 }
 
-/// Scores by seed and image.
 type ScoreTable = Vec<Vec<f64>>;
 
 impl Comparison {

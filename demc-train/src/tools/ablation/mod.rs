@@ -92,7 +92,6 @@ pub fn run(
     Ok(AblationOutcome::Done(Comparison::new(spec, &runs)?))
 }
 
-/// Checks `train.init` of each run that has not started, before the first one trains for hours.
 fn check_init(spec: &AblationSpec) -> anyhow::Result<()> {
     for seed in &spec.seeds {
         for variant in &spec.variants {
@@ -105,7 +104,6 @@ fn check_init(spec: &AblationSpec) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The scores of a complete run; `None` if it is not complete.
 fn finished(config: &Config) -> anyhow::Result<Option<FinishedRun>> {
     let dir = config.run_dir();
     let scores = dir.join(SCORES);

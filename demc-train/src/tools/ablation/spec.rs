@@ -18,7 +18,6 @@ use serde::Deserialize;
 
 use crate::config::{Config, ConfigError, one_line};
 
-/// The TOML file.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct AblationFile {

@@ -13,18 +13,14 @@ use demc_infer::statistics::{Estimate, RESAMPLES};
 
 /// Name of all files, without extension.
 const STEM: &str = "ablation";
-/// Pixels in a megapixel.
 const MEGAPIXEL: f64 = 1e6;
-/// Operations of a GFLOP.
 const GIGA: f64 = 1e9;
 
-/// The difference of the first variant from itself.
 const NO_DIFFERENCE: Estimate = Estimate {
     mean: 0.0,
     interval: [0.0; 2],
 };
 
-/// Writes all four files into `dir`.
 pub(super) fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<Vec<PathBuf>> {
     std::fs::create_dir_all(dir).with_context(|| dir.display().to_string())?;
     let texts = [
@@ -42,7 +38,6 @@ pub(super) fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<Vec<P
     Ok(paths)
 }
 
-/// The table with explanation and conclusions.
 pub(super) fn markdown(comparison: &Comparison) -> String {
     let Comparison {
         seeds,
@@ -142,7 +137,6 @@ fn difference(estimate: Option<Estimate>) -> String {
     format!("{text} ({low:+.4} to {high:+.4})")
 }
 
-/// One row per variant, plain numbers.
 fn csv(comparison: &Comparison) -> String {
     let estimate = |found: Option<Estimate>| match found {
         Some(Estimate {

@@ -28,7 +28,6 @@ fn names_fit(panel: &BarPanel) -> bool {
     panel.names.iter().all(|name| frame::width(name) < slot)
 }
 
-/// Draws `panel` into `area`.
 pub(super) fn draw<B: DrawingBackend>(area: &Area<B>, panel: &BarPanel) -> DrawResult<(), B> {
     let bars = || panel.names.iter().zip(&panel.bars);
     let values: Vec<f64> = bars().flat_map(|(_, bar)| shown(bar, panel.y)).collect();

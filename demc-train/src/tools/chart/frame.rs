@@ -12,15 +12,11 @@ use super::axis::{Axis, number};
 const PALETTE: [u32; 8] = [
     0x0072B2, 0xD55E00, 0x009E73, 0xCC79A7, 0xE69F00, 0x56B4E9, 0x000000, 0xF0E442,
 ];
-/// Colour of text and intervals.
 pub(super) const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
-/// Colour of axes.
 pub(super) const GREY: RGBColor = RGBColor(0x77, 0x77, 0x77);
-/// Colours of the grid lines: at labelled values, between them.
 const GRID: [RGBColor; 2] = [RGBColor(0xD0, 0xD0, 0xD0), RGBColor(0xEC, 0xEC, 0xEC)];
 /// Text sizes of titles and of all other text, in drawing units.
 pub(super) const SIZES: [f64; 2] = [36.0, 30.0];
-/// Height of a line of text.
 pub(super) const ROW: i32 = 40;
 /// Offset that centres text vertically where `plotters` places it too high.
 pub(super) const LOWER: i32 = 4;
@@ -32,14 +28,11 @@ const POINTS: f64 = 1.0 / 1.24;
 /// `sans-serif` fonts (Verdana, DejaVu Sans) averages 0.58 to 0.62, in Arial and Helvetica 0.5.
 const CHARACTER: f64 = 0.65;
 
-/// A drawing area of a panel.
 pub(super) type Area<B> = DrawingArea<B, Shift>;
-/// A panel with its axes.
 pub(super) type Chart<'a, B> = ChartContext<'a, B, Cartesian2d<Axis, Axis>>;
 /// Names with their index in the palette.
 pub(super) type LegendEntries = Vec<(String, usize)>;
 
-/// The colour with this index: the palette, then the palette in greyer tones.
 pub(super) fn palette(color: usize) -> RGBColor {
     let [_, red, green, blue] = PALETTE[color % PALETTE.len()].to_be_bytes();
     match color < PALETTE.len() {
@@ -48,7 +41,6 @@ pub(super) fn palette(color: usize) -> RGBColor {
     }
 }
 
-/// The font of a text size.
 pub(super) fn font(size: f64) -> FontDesc<'static> {
     FontDesc::new(FontFamily::SansSerif, size, FontStyle::Normal)
 }

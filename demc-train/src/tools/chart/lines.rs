@@ -9,7 +9,6 @@ use super::frame::{self, Area, Chart, INK, LegendEntries, ROW, palette, text_sty
 
 /// Line widths of a series and of a faint one, in drawing units.
 const WIDTHS: [u32; 2] = [4, 2];
-/// Radius of a point drawn as a dot.
 const RADIUS: u32 = 7;
 /// Share of its colour that a faint series keeps.
 const FAINT: f64 = 0.35;
@@ -18,14 +17,12 @@ const FEW: usize = 40;
 /// Margins as shares of an axis: beyond the data, and per label of a mark.
 const MARGINS: [f64; 2] = [0.04, 0.06];
 
-/// Legend entries of a panel.
 pub(super) fn entries(panel: &LinePanel) -> LegendEntries {
     let named = |series: &&Series| !series.faint && !series.name.is_empty();
     let shown = panel.series.iter().filter(named);
     shown.map(|s| (s.name.clone(), s.color)).collect()
 }
 
-/// Draws `panel` into `area`.
 pub(super) fn draw<B: DrawingBackend>(area: &Area<B>, panel: &LinePanel) -> DrawResult<(), B> {
     let is_shown = |point: &(f64, f64)| shows(panel.x, point.0) && shows(panel.y, point.1);
     let points = || panel.series.iter().flat_map(|series| &series.points);
@@ -53,7 +50,6 @@ pub(super) fn draw<B: DrawingBackend>(area: &Area<B>, panel: &LinePanel) -> Draw
     draw_marks(&mut chart, &marks.collect::<Vec<_>>())
 }
 
-/// Draws the part of a series between two gaps.
 fn draw_run<B: DrawingBackend>(
     chart: &mut Chart<B>,
     series: &Series,

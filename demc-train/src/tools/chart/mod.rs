@@ -53,7 +53,6 @@ pub(crate) fn with_extension(stem: &Path, extension: &str) -> PathBuf {
     path.into()
 }
 
-/// The text of an SVG file.
 fn svg(page: &FigurePage) -> anyhow::Result<String> {
     let mut text = String::new();
     let size = page.size();

@@ -11,12 +11,10 @@ use super::{bars, lines};
 /// Length of the sample line in a legend.
 const SAMPLE: i32 = 44;
 
-/// A figure and the layout of its parts.
 pub(super) struct FigurePage<'a> {
     figure: &'a Figure,
     /// Rows and columns of panels.
     grid: (usize, usize),
-    /// Width and height of a panel in drawing units.
     panel: (u32, u32),
     legend: LegendEntries,
 }
@@ -46,7 +44,6 @@ impl<'a> FigurePage<'a> {
         }
     }
 
-    /// Width and height in drawing units.
     pub(super) fn size(&self) -> (u32, u32) {
         let panels = self.grid.1 as u32 * self.panel.0;
         let widest = self.legend.iter().map(|(name, _)| width(name)).max();

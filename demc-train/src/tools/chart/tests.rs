@@ -42,7 +42,6 @@ fn bars(names: &[&str], values: &[f64]) -> BarPanel {
     }
 }
 
-/// Writes a figure and returns the text of the SVG.
 fn written(figure: &Figure) -> String {
     let dir = tempfile::tempdir().unwrap();
     let path = figure.write(&dir.path().join("chart.v1")).unwrap();
@@ -51,12 +50,10 @@ fn written(figure: &Figure) -> String {
     fs::read_to_string(path).unwrap()
 }
 
-/// A colour as SVG writes it.
 fn hex(RGBColor(red, green, blue): RGBColor) -> String {
     format!("#{red:02X}{green:02X}{blue:02X}")
 }
 
-/// An attribute of an SVG element.
 fn attribute<'a>(line: &'a str, name: &str) -> &'a str {
     let value = line.split(&format!(" {name}=\"")).nth(1).unwrap();
     value.split('"').next().unwrap()

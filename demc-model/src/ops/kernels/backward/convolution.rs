@@ -9,7 +9,6 @@ use demc_kernels::{Grid, Isa, conv1x1, conv3x3, deconv4x4};
 
 use super::super::{buffer, contiguous, dims, grid, maps, tensor, values};
 
-/// The state that a convolution of `P` inputs keeps for its backward pass.
 #[derive(Clone, Debug)]
 pub(super) struct ConvState<const P: usize> {
     pub(super) inputs: [FlexTensor; P],
@@ -18,7 +17,6 @@ pub(super) struct ConvState<const P: usize> {
     pub(super) y: Option<FlexTensor>,
 }
 
-/// The arguments of a convolution kernel's backward pass.
 struct ConvGradients<'a, const P: usize> {
     grid: Grid,
     inputs: [&'a [f32]; P],

@@ -19,7 +19,6 @@ use super::forward::{fuse, rel_mse_into};
 use super::{KernelOps, buffer, contiguous, dims, grid, maps, tensor, values};
 use convolution::{Conv3x3, ConvState, Deconv4x4, Fuse};
 
-/// A tensor of `flex` under autodiff.
 type Tracked = FloatTensor<Autodiff<Flex>>;
 
 impl<C: CheckpointStrategy> KernelOps for Autodiff<Flex, C> {
@@ -171,7 +170,6 @@ fn fuse_recorded<C: CheckpointStrategy, const P: usize, const N: usize>(
 struct MaxPool;
 
 impl Backward<Flex, 1> for MaxPool {
-    /// The input.
     type State = FlexTensor;
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
@@ -189,7 +187,6 @@ impl Backward<Flex, 1> for MaxPool {
 #[derive(Debug)]
 struct BatchNorm;
 
-/// The state that a batch normalisation keeps for its backward pass.
 #[derive(Clone, Debug)]
 struct NormState {
     x: FlexTensor,
