@@ -21,10 +21,7 @@ pub enum Error {
     },
     /// Not an OpenEXR file, truncated, damaged, or of an unsupported kind (deep data, subsampling).
     #[error("{}: not a readable OpenEXR file: {detail}", path.display())]
-    Exr {
-        path: PathBuf,
-        detail: String,
-    },
+    Exr { path: PathBuf, detail: String },
     /// The file lacks channels that the layout names.
     #[error("{}: no channel {}; the file has {}", path.display(), missing.join(", "), present.join(", "))]
     MissingChannels {
@@ -60,10 +57,7 @@ pub enum Error {
     },
     /// An unusable channel layout.
     #[error("channel layout {name}: {detail}")]
-    Layout {
-        name: String,
-        detail: String,
-    },
+    Layout { name: String, detail: String },
     /// An unusable data set; the message names every problem.
     #[error("data set {}: {}", root.display(), problems.join("; "))]
     Dataset {

@@ -32,10 +32,7 @@ pub enum BaselineError {
     Taken(String),
     /// Missing images.
     #[error("baseline {name}: missing {}", paths.join(", "))]
-    Missing {
-        name: String,
-        paths: Vec<String>,
-    },
+    Missing { name: String, paths: Vec<String> },
     /// An image of another size.
     #[error("{}: is {found}, but the scene is {expected}", path.display())]
     Size {

@@ -21,15 +21,10 @@ pub const KNOWN: &str = "flex, ndarray, wgpu[:N], cuda[:N]";
 pub enum DeviceError {
     /// The name is unknown.
     #[error("unknown device `{name}`; known devices: {KNOWN}")]
-    Unknown {
-        name: String,
-    },
+    Unknown { name: String },
     /// The backend exists, but is not in this build.
     #[error("device `{name}`: not in this build; build with `--features {feature}`")]
-    NotBuilt {
-        name: String,
-        feature: &'static str,
-    },
+    NotBuilt { name: String, feature: &'static str },
     /// The runtime lists no such device on this machine.
     #[error("device `{name}`: not on this machine, which has {found} such device(s); {hint}")]
     Absent {
@@ -40,10 +35,7 @@ pub enum DeviceError {
     },
     /// The device is listed, but a test computation on it failed.
     #[error("device `{name}`: a test computation failed: {reason}")]
-    Broken {
-        name: String,
-        reason: String,
-    },
+    Broken { name: String, reason: String },
 }
 
 /// The device called `name`: `flex`, `ndarray`, `wgpu`, `wgpu:N`, `cuda` or `cuda:N`.

@@ -26,10 +26,7 @@ pub enum DenoiseError {
     },
     /// The image does not fit into memory.
     #[error("{name}")]
-    Memory {
-        name: String,
-        source: TooLarge,
-    },
+    Memory { name: String, source: TooLarge },
     /// A feature channel is far from the training data: another unit, or another buffer.
     #[error(
         "{name}: {channel} does not fit the model's statistics: \
@@ -72,9 +69,7 @@ pub enum DenoiseError {
     },
     /// The frame has no reference to compare with.
     #[error("{name}: no reference in the file")]
-    NoReference {
-        name: String,
-    },
+    NoReference { name: String },
 }
 
 pub(crate) fn check_sizes(frame: &Frame) -> Result<(), DenoiseError> {

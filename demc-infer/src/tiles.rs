@@ -222,7 +222,6 @@ mod tests {
         }
     }
 
-    /// Compares with every possible grid.
     #[test]
     fn no_grid_that_fits_computes_less() {
         let (height, width, available) = (736, 1280, 900 * 700);

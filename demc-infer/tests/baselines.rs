@@ -145,13 +145,7 @@ fn missing_images_and_other_sizes_are_named_before_anything_is_computed() {
         write_rgb(&path, 2, 3, &[1.0; 18], SamplePrecision::Half).expect("written");
     }
     let outcome = demc_infer(list("evaluate")).failure(1, "");
-    assert!(
-        outcome
-            .stderr
-            .contains("col-dining-room-1.exr: is 2x3, but the scene is "),
-        "{}",
-        outcome.stderr
-    );
+    outcome.says("col-dining-room-1.exr: is 2x3, but the scene is ");
 }
 
 #[test]
@@ -172,7 +166,7 @@ fn a_report_is_one_file_with_the_numbers_of_evaluate() {
     let model = run.path();
     let list = arguments!["report", "--model", model, "--data", sample(), "-o", page];
     let outcome = demc_infer(list).success();
-    assert!(outcome.stdout.contains("4 images"), "{}", outcome.stdout);
+    outcome.says("4 images");
     let list = arguments![
         "evaluate",
         "--model",

@@ -120,11 +120,7 @@ fn an_export_gives_the_same_scores_with_both_naming_schemes() {
     let format = ["--format", "safetensors"];
     let flags = [&format[..], &["--names", "torch", "--precision", "f32"]].concat();
     let outcome = export(run.path(), &file, &flags).success();
-    assert!(
-        outcome.stdout.contains("read back and compared"),
-        "{}",
-        outcome.stdout
-    );
+    outcome.says("read back and compared");
     assert_eq!(scores(&file, &[]), scores(run.path(), &[]));
 }
 

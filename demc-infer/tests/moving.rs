@@ -38,12 +38,8 @@ fn a_deviation_fails_after_its_numbers_were_printed() {
     let copy = r#"for i in 0 1 2 3; do cp "$5/$i.color" "$5/$i.output"; done; echo Copy 1.0"#;
     let (outcome, exists) = verified(copy);
     assert!(exists, "the export stays, to be looked at");
-    assert!(outcome.stdout.contains("Copy 1.0"), "{}", outcome.stdout);
-    assert!(
-        outcome.stdout.contains("\n2 x 224 x  32  "),
-        "{}",
-        outcome.stdout
-    );
+    outcome.says("Copy 1.0");
+    outcome.says("\n2 x 224 x  32  ");
     let stderr = outcome.failure(1, "").stderr;
     assert!(
         stderr.contains("x.onnx: deviates by more than 1e-4"),
@@ -104,11 +100,7 @@ fn an_import_equals_the_export_byte_for_byte() {
     let model = file("best.safetensors");
     export(run.path(), &torch, &["--names", "torch"]).success();
     let outcome = demc_infer(arguments!["import", torch, "-o", back]).success();
-    assert!(
-        outcome.stdout.contains("read back and compared"),
-        "{}",
-        outcome.stdout
-    );
+    outcome.says("read back and compared");
     demc_infer(arguments![
         "import",
         torch,

@@ -42,7 +42,6 @@ pub(crate) enum Right {
 pub(crate) struct Panels {
     /// Columns, rounded up to whole vectors.
     pub(crate) padded: usize,
-    /// Columns of a full panel.
     pub(crate) full: usize,
 }
 

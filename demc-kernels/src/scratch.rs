@@ -7,7 +7,6 @@ use std::sync::Mutex;
 
 use crate::memory;
 
-/// A cache line: the alignment of buffers.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 struct CacheLine(#[allow(dead_code, reason = "read through a pointer")] [f32; LINE]);

@@ -79,3 +79,33 @@ pub(crate) fn same_on_any_number_of_threads<R: PartialEq + Send>(work: impl Fn()
 pub(crate) fn bits(x: &[f32]) -> Vec<u32> {
     x.iter().map(|x| x.to_bits()).collect()
 }
+
+/// Compares `forward` and `backward` of the calling module with the loops of `reference`, with and
+/// without a ReLU.
+macro_rules! assert_equals_reference {
+    ($forward:ident, $backward:ident, $name:expr, $isa:expr, $grid:expr, $x:expr, $weight:expr, $dy:expr, $outputs:expr) => {
+        let (x, weight, dy, bias) = ($x, $weight, $dy, pattern($outputs, 3));
+        for relu in [false, true] {
+            let mut y = vec![f32::NAN; dy.len()];
+            forward($isa, $grid, &x, &weight, &bias, relu, &mut y);
+            let expected =
+                reference::$forward($grid, &f64s(&x), &f64s(&weight), &f64s(&bias), relu);
+            assert_close(&format!("{} y", $name), &y, &expected);
+
+            let gate = relu.then_some(&y[..]);
+            let gated = match gate {
+                Some(y) => reference::gated(&f64s(&dy), &f64s(y)),
+                None => f64s(&dy),
+            };
+            let expected = reference::$backward($grid, &f64s(&x), &f64s(&weight), &gated);
+            let (mut dx, mut dweight) = (vec![f32::NAN; x.len()], vec![f32::NAN; weight.len()]);
+            let mut dbias = vec![f32::NAN; $outputs];
+            let (dx_out, dw, db) = (Some(&mut dx[..]), &mut dweight, &mut dbias);
+            backward($isa, $grid, &x, &weight, gate, &dy, dx_out, dw, db);
+            assert_close(&format!("{} dx", $name), &dx, &expected.dx);
+            assert_close(&format!("{} dweight", $name), &dweight, &expected.dweight);
+            assert_close(&format!("{} dbias", $name), &dbias, &expected.dbias);
+        }
+    };
+}
+pub(crate) use assert_equals_reference;

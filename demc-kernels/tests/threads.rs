@@ -43,30 +43,28 @@ const GRID: Grid = Grid {
     width: 45,
 };
 
+macro_rules! convolution_gives_the_same {
+    ($kernel:ident, $inputs:expr, $outputs:expr, $taps:expr, $pixels:expr) => {
+        let x = pattern(GRID.pixels() * $inputs, 1);
+        let (weight, bias) = (pattern($outputs * $inputs * $taps, 2), pattern($outputs, 3));
+        let dy = pattern($pixels * $outputs, 4);
+        let name = format!("{} {} to {}", stringify!($kernel), $inputs, $outputs);
+        assert_same(&name, |isa| {
+            let mut y = vec![0.0; dy.len()];
+            $kernel::forward(isa, GRID, &x, &weight, &bias, true, &mut y);
+            let mut dx = vec![0.0; x.len()];
+            let (mut dweight, mut dbias) = (vec![0.0; weight.len()], vec![0.0; $outputs]);
+            let (dx_out, dw, db) = (Some(&mut dx[..]), &mut dweight, &mut dbias);
+            $kernel::backward(isa, GRID, &x, &weight, Some(&y), &dy, dx_out, dw, db);
+            vec![y, dx, dweight, dbias]
+        });
+    };
+}
+
 #[test]
 fn conv3x3_of_every_kind() {
     for (inputs, outputs) in [(3, 16), (16, 3), (24, 40)] {
-        let x = pattern(GRID.pixels() * inputs, 1);
-        let (weight, bias) = (pattern(outputs * inputs * 9, 2), pattern(outputs, 3));
-        let dy = pattern(GRID.pixels() * outputs, 4);
-        assert_same(&format!("conv3x3 {inputs} to {outputs}"), |isa| {
-            let mut y = vec![0.0; dy.len()];
-            conv3x3::forward(isa, GRID, &x, &weight, &bias, true, &mut y);
-            let mut dx = vec![0.0; x.len()];
-            let (mut dweight, mut dbias) = (vec![0.0; weight.len()], vec![0.0; outputs]);
-            conv3x3::backward(
-                isa,
-                GRID,
-                &x,
-                &weight,
-                Some(&y),
-                &dy,
-                Some(&mut dx),
-                &mut dweight,
-                &mut dbias,
-            );
-            vec![y, dx, dweight, dbias]
-        });
+        convolution_gives_the_same!(conv3x3, inputs, outputs, 9, GRID.pixels());
     }
 }
 
@@ -101,26 +99,5 @@ fn conv1x1_gives_the_same() {
 
 #[test]
 fn deconv4x4_gives_the_same() {
-    let (inputs, outputs) = (20, 17);
-    let x = pattern(GRID.pixels() * inputs, 1);
-    let (weight, bias) = (pattern(inputs * outputs * 16, 2), pattern(outputs, 3));
-    let dy = pattern(GRID.doubled().pixels() * outputs, 4);
-    assert_same("deconv4x4", |isa| {
-        let mut y = vec![0.0; dy.len()];
-        deconv4x4::forward(isa, GRID, &x, &weight, &bias, true, &mut y);
-        let mut dx = vec![0.0; x.len()];
-        let (mut dweight, mut dbias) = (vec![0.0; weight.len()], vec![0.0; outputs]);
-        deconv4x4::backward(
-            isa,
-            GRID,
-            &x,
-            &weight,
-            Some(&y),
-            &dy,
-            Some(&mut dx),
-            &mut dweight,
-            &mut dbias,
-        );
-        vec![y, dx, dweight, dbias]
-    });
+    convolution_gives_the_same!(deconv4x4, 20, 17, 16, GRID.doubled().pixels());
 }

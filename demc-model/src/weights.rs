@@ -178,9 +178,7 @@ impl Weights {
 pub enum WeightsError {
     /// A tensor of the network is missing.
     #[error("weight {name} is missing")]
-    Missing {
-        name: String,
-    },
+    Missing { name: String },
     /// A tensor has another shape.
     #[error("weight {name}: expected shape {expected:?}, found {found:?}")]
     Shape {
@@ -313,7 +311,6 @@ pub(crate) fn taken(
     |spec, _| weights.take(&spec.name, &spec.shape).map(Some)
 }
 
-/// No values; appends the description of each tensor to `specs`.
 pub(crate) fn described(
     specs: &mut Vec<WeightSpec>,
 ) -> impl FnMut(&WeightSpec, Init) -> Result<Option<Vec<f32>>, WeightsError> {

@@ -7,14 +7,13 @@ use std::process::Stdio;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use common::{command, config, error_line, stderr, train};
+use common::{command, config, error_line, place, says, stderr, train, trained};
 
 #[test]
 fn a_short_run_writes_all_files() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let run = dir.path().join("run");
-    let output = train(&config(dir.path()), &run, &["--set", "train.steps=4"]);
-    assert!(output.status.success(), "{}", stderr(&output));
+    let output = trained(&config(dir.path()), &run, &["--set=train.steps=4"]);
     assert_eq!(stderr(&output), "", "no progress bar without a terminal");
 
     let text = String::from_utf8_lossy(&output.stdout);
@@ -79,10 +78,8 @@ fn every_variant_and_reading_trains() {
                 &variant,
                 "--set",
                 &reading,
-                "--set",
-                "train.steps=1",
-                "--set",
-                "data.validation=0",
+                "--set=train.steps=1",
+                "--set=data.validation=0",
             ];
             let output = train(&config, &run, &sets);
             let text = String::from_utf8_lossy(&output.stdout);
@@ -101,16 +98,13 @@ fn every_variant_and_reading_trains() {
 fn check_writes_nothing() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let run = dir.path().join("run");
-    let output = train(&config(dir.path()), &run, &["--check"]);
-    assert!(output.status.success(), "{}", stderr(&output));
+    trained(&config(dir.path()), &run, &["--check"]);
     assert!(!run.exists());
 }
 
 #[test]
 fn invalid_configurations_exit_with_2_and_one_line() {
-    let dir = tempfile::tempdir().expect("a temporary directory");
-    let config = config(dir.path());
-    let run = dir.path().join("run");
+    let (dir, config, run) = place();
     let error = |set: &str| error_line(&train(&config, &run, &["--set", set]), 2);
     assert!(error("train.step=3").contains("did you mean `train.steps`?"));
     assert!(error("model.variant=unet").contains("demc-nosn"));
@@ -118,7 +112,7 @@ fn invalid_configurations_exit_with_2_and_one_line() {
         &train(
             &config,
             &run,
-            &["--set", "train.steps=0", "--set", "data.stride=0"],
+            &["--set=train.steps=0", "--set=data.stride=0"],
         ),
         2,
     );
@@ -133,9 +127,9 @@ fn invalid_configurations_exit_with_2_and_one_line() {
     let misspelt = dir.path().join("misspelt.toml");
     fs::write(&misspelt, "[model]\n\nwidht = 3\n").expect("a file");
     let error = error_line(&train(&misspelt, &run, &[]), 2);
-    assert!(
-        error.contains("misspelt.toml:3: unknown key `model.widht`; did you mean `model.width`?"),
-        "{error}"
+    says(
+        &error,
+        "misspelt.toml:3: unknown key `model.widht`; did you mean `model.width`?",
     );
     let error = error_line(&train(&dir.path().join("none.toml"), &run, &[]), 2);
     assert!(error.contains("none.toml"), "{error}");
@@ -144,23 +138,21 @@ fn invalid_configurations_exit_with_2_and_one_line() {
 
 #[test]
 fn invalid_data_and_directories_exit_with_1_and_one_line() {
-    let dir = tempfile::tempdir().expect("a temporary directory");
-    let config = config(dir.path());
-    let run = dir.path().join("run");
+    let (dir, config, run) = place();
     let error = |args: &[&str]| error_line(&train(&config, &run, args), 1);
     let device = error_line(&train(&config, &run, &["--device", "tpu"]), 2);
     assert!(device.contains("known devices: flex"), "{device}");
-    assert!(error(&["--set", "data.root=/nowhere/at/all"]).contains("/nowhere/at/all"));
-    assert!(error(&["--set", "data.layout=blender"]).contains("blender"));
+    assert!(error(&["--set=data.root=/nowhere/at/all"]).contains("/nowhere/at/all"));
+    assert!(error(&["--set=data.layout=blender"]).contains("blender"));
     assert!(
-        error(&["--set", "data.patch_size=256"]).contains("224"),
+        error(&["--set=data.patch_size=256"]).contains("224"),
         "a scene smaller than a patch"
     );
     assert!(!run.exists(), "nothing is written");
 
     let file = dir.path().join("file");
     fs::write(&file, "").expect("a file");
-    let output = train(&config, &file.join("run"), &["--set", "train.steps=1"]);
+    let output = train(&config, &file.join("run"), &["--set=train.steps=1"]);
     assert!(
         error_line(&output, 1).contains("file"),
         "a run directory that cannot be created"
@@ -172,7 +164,7 @@ fn invalid_data_and_directories_exit_with_1_and_one_line() {
 fn one_thread_is_enough() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let run = dir.path().join("run");
-    let mut child = command(&config(dir.path()), &run, &["--set", "train.steps=2"])
+    let mut child = command(&config(dir.path()), &run, &["--set=train.steps=2"])
         .env("RAYON_NUM_THREADS", "1")
         .stdout(Stdio::null())
         .stderr(Stdio::null())

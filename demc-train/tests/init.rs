@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
-use common::{config, error_line, stderr, train};
+use common::{config, error_line, train, trained};
 use demc_infer::Bundle;
 use demc_infer::bundle::{Names, Precision};
 use demc_train::run::checkpoint::store::sha256_of;
@@ -40,8 +40,7 @@ struct SecondRun {
 fn second_run(dir: &Path) -> SecondRun {
     let config = config(dir);
     let first = dir.join("first");
-    let output = train(&config, &first, &["--set", "train.steps=2"]);
-    assert!(output.status.success(), "{}", stderr(&output));
+    trained(&config, &first, &["--set=train.steps=2"]);
     SecondRun {
         config,
         init: format!("train.init={}", first.display()),
@@ -55,27 +54,20 @@ fn a_run_starts_from_the_weights_of_another() {
     let config = config(dir.path());
     let path = |name: &str| dir.path().join(name);
     let (first, second, third) = (path("first"), path("second"), path("third"));
-    let plain = ["--set", "train.ema_decay="];
-    let few = [&plain[..], &["--set", "train.steps=3"]].concat();
-    let output = train(&config, &first, &few);
-    assert!(output.status.success(), "{}", stderr(&output));
+    let plain = ["--set=train.ema_decay="];
+    let few = [&plain[..], &["--set=train.steps=3"]].concat();
+    trained(&config, &first, &few);
 
     // One step with a rate that rounds to zero.
     let init = format!("train.init={}", first.display());
-    let one = [
-        "--set",
-        "train.steps=1",
-        "--set",
-        "optimizer.lr_start=1e-30",
-    ];
+    let one = ["--set=train.steps=1", "--set=optimizer.lr_start=1e-30"];
     let still = [
         &plain[..],
         &one,
-        &["--set", "optimizer.lr_end=1e-30", "--set", &init],
+        &["--set=optimizer.lr_end=1e-30", "--set", &init],
     ]
     .concat();
-    let output = train(&config, &second, &still);
-    assert!(output.status.success(), "{}", stderr(&output));
+    trained(&config, &second, &still);
     assert_same(&first, &second);
     let record = fs::read(second.join("run.json")).expect("a record");
     let record: serde_json::Value = serde_json::from_slice(&record).expect("JSON");
@@ -85,13 +77,11 @@ fn a_run_starts_from_the_weights_of_another() {
     assert_eq!(record["init"]["sha256"], sum.as_str());
 
     // Another seed would initialise another network. A resume does not need the initial weights.
-    let seeded = [&still[..], &["--set", "train.seed=2"]].concat();
-    let output = train(&config, &third, &seeded);
-    assert!(output.status.success(), "{}", stderr(&output));
+    let seeded = [&still[..], &["--set=train.seed=2"]].concat();
+    trained(&config, &third, &seeded);
     assert_same(&first, &third);
     fs::remove_dir_all(&first).expect("the test's own");
-    let output = train(&config, &third, &[&seeded[..], &["--resume"]].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
+    trained(&config, &third, &[&seeded[..], &["--resume"]].concat());
 }
 
 #[test]
@@ -100,8 +90,7 @@ fn ranges_of_the_first_run_are_kept() {
     let config = config(dir.path());
     let path = |name: &str| dir.path().join(name);
     let (first, wide, second) = (path("first"), path("wide.safetensors"), path("second"));
-    let output = train(&config, &first, &["--set", "train.steps=2"]);
-    assert!(output.status.success(), "{}", stderr(&output));
+    trained(&config, &first, &["--set=train.steps=2"]);
     let mut bundle = Bundle::load(&first, &Device::flex()).expect("a network");
     let own = bundle.meta.ranges.clone().expect("ranges");
     bundle.meta.ranges.as_mut().expect("ranges").exposure.high = 99.0;
@@ -109,10 +98,9 @@ fn ranges_of_the_first_run_are_kept() {
     saved.expect("a file");
 
     let init = format!("train.init={}", wide.display());
-    let sets = ["--set", "train.steps=2", "--set", &init];
+    let sets = ["--set=train.steps=2", "--set", &init];
     let ranges_after = |more: &[&str]| {
-        let output = train(&config, &second, &[&sets[..], more].concat());
-        assert!(output.status.success(), "{}", stderr(&output));
+        trained(&config, &second, &[&sets[..], more].concat());
         let bundle = Bundle::load(&second, &Device::flex()).expect("a network");
         bundle.meta.ranges.expect("ranges")
     };
@@ -136,12 +124,11 @@ fn a_change_of_the_input_colour_is_noted() {
     } = second_run(dir.path());
     let note = |epsilon: &str| {
         let set = format!("data.albedo_demodulation_epsilon={epsilon}");
-        let output = train(
+        let output = trained(
             &config,
             &second,
             &["--set", &init, "--set", &set, "--check"],
         );
-        assert!(output.status.success(), "{}", stderr(&output));
         let said = String::from_utf8_lossy(&output.stdout).into_owned();
         let note = said
             .lines()
@@ -161,12 +148,12 @@ fn weights_of_another_network_are_refused_before_anything_is_written() {
         init,
         second,
     } = second_run(dir.path());
-    let wider = ["--set", &init, "--set", "model.width=3"];
+    let wider = ["--set", &init, "--set=model.width=3"];
     let line = error_line(&train(&config, &second, &wider), 1);
     assert!(line.contains("train.init"), "{line}");
     assert!(line.contains("model.width: 3 instead of 2"), "{line}");
 
-    let nothing = ["--set", "train.init=nowhere.safetensors"];
+    let nothing = ["--set=train.init=nowhere.safetensors"];
     let line = error_line(&train(&config, &second, &nothing), 1);
     assert!(
         line.contains("train.init") && line.contains("nowhere.safetensors"),

@@ -7,7 +7,9 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use common::{assert_same_run, command, config, error_line, metrics, stderr, train};
+use common::{
+    assert_same_run, command, config, error_line, metrics, place, says, stderr, train, trained,
+};
 
 /// Starts the run and kills it (SIGKILL) once its log has `lines` lines. Returns whether it was
 /// still running.
@@ -36,16 +38,14 @@ fn a_killed_and_resumed_run_equals_an_uninterrupted_one() {
     let config = config(dir.path());
     let (whole, broken) = (dir.path().join("whole"), dir.path().join("broken"));
 
-    let output = train(&config, &whole, &[]);
-    assert!(output.status.success(), "{}", stderr(&output));
+    trained(&config, &whole, &[]);
     assert_eq!(metrics(&whole).len(), 6);
 
     // Before the first checkpoint, between two checkpoints, and after a validation.
     assert!(kill_after(&config, &broken, &[], 1));
     assert!(kill_after(&config, &broken, &["--resume"], 2));
     assert!(kill_after(&config, &broken, &["--resume"], 4));
-    let output = train(&config, &broken, &["--resume"]);
-    assert!(output.status.success(), "{}", stderr(&output));
+    trained(&config, &broken, &["--resume"]);
 
     assert_same_run(&whole, &broken, "killed three times");
     let kept = fs::read_dir(broken.join("checkpoints"))
@@ -59,32 +59,21 @@ fn the_saved_configuration_repeats_the_run() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let (first, second) = (dir.path().join("first"), dir.path().join("second"));
-    assert!(
-        train(&config, &first, &["--set", "train.steps=4"])
-            .status
-            .success()
-    );
-    let output = train(&first.join("config.toml"), &second, &[]);
-    assert!(output.status.success(), "{}", stderr(&output));
+    trained(&config, &first, &["--set=train.steps=4"]);
+    trained(&first.join("config.toml"), &second, &[]);
     assert_eq!(metrics(&first), metrics(&second));
 }
 
 #[test]
 fn a_directory_with_another_run_is_refused() {
-    let dir = tempfile::tempdir().expect("a temporary directory");
-    let config = config(dir.path());
-    let run = dir.path().join("run");
-    assert!(
-        train(&config, &run, &["--set", "train.steps=3"])
-            .status
-            .success()
-    );
+    let (_dir, config, run) = place();
+    trained(&config, &run, &["--set=train.steps=3"]);
     let before = fs::read(run.join("metrics.jsonl")).expect("a log");
 
-    let error = error_line(&train(&config, &run, &["--set", "train.steps=3"]), 1);
+    let error = error_line(&train(&config, &run, &["--set=train.steps=3"]), 1);
     assert!(error.contains("--resume resumes it"), "{error}");
     let error = error_line(
-        &train(&config, &run, &["--resume", "--set", "train.seed=2"]),
+        &train(&config, &run, &["--resume", "--set=train.seed=2"]),
         1,
     );
     assert!(
@@ -103,12 +92,12 @@ fn missing_and_damaged_files_cost_at_most_one_checkpoint() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());
     let (whole, run) = (dir.path().join("whole"), dir.path().join("run"));
-    assert!(train(&config, &whole, &[]).status.success());
+    trained(&config, &whole, &[]);
     let expected = |file: &str| fs::read(whole.join(file)).expect(file);
     let last = "checkpoints/step-00000012";
     let before = "checkpoints/step-00000009";
 
-    assert!(train(&config, &run, &[]).status.success());
+    trained(&config, &run, &[]);
     let half = |path: &Path| {
         let bytes = fs::read(path).expect("a file");
         fs::write(path, &bytes[..bytes.len() / 2]).expect("a file");
@@ -166,11 +155,9 @@ fn missing_and_damaged_files_cost_at_most_one_checkpoint() {
 
 #[test]
 fn checkpoints_of_another_format_are_refused() {
-    let dir = tempfile::tempdir().expect("a temporary directory");
-    let config = config(dir.path());
-    let run = dir.path().join("run");
-    let set = ["--set", "train.steps=3"];
-    assert!(train(&config, &run, &set).status.success());
+    let (_dir, config, run) = place();
+    let set = ["--set=train.steps=3"];
+    trained(&config, &run, &set);
     let checkpoint = run.join("checkpoints/step-00000003");
     let state = checkpoint.join("state.json");
     let text = fs::read_to_string(&state).expect("a state");
@@ -182,19 +169,16 @@ fn checkpoints_of_another_format_are_refused() {
         .output()
         .expect("sha256sum");
     fs::write(checkpoint.join("SHA256SUMS"), sums.stdout).expect("sums");
-    let error = error_line(&train(&config, &run, &["--resume", set[0], set[1]]), 1);
-    assert!(
-        error.contains("state.json: format 99; this build reads format 2"),
-        "{error}"
-    );
+    let error = error_line(&train(&config, &run, &["--resume", set[0]]), 1);
+    says(&error, "state.json: format 99; this build reads format 2");
 }
 
 #[test]
 fn checksums_are_those_of_sha256sum() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let run = dir.path().join("run");
-    let set = ["--set", "train.steps=4"];
-    assert!(train(&config(dir.path()), &run, &set).status.success());
+    let set = ["--set=train.steps=4"];
+    trained(&config(dir.path()), &run, &set);
     let output = std::process::Command::new("sha256sum")
         .current_dir(run.join("checkpoints/step-00000004"))
         .args(["--strict", "-c", "SHA256SUMS"])
@@ -209,9 +193,7 @@ fn checksums_are_those_of_sha256sum() {
 
 #[test]
 fn a_changed_layout_and_a_locked_directory_are_refused() {
-    let dir = tempfile::tempdir().expect("a temporary directory");
-    let config = config(dir.path());
-    let run = dir.path().join("run");
+    let (dir, config, run) = place();
     let layout = dir.path().join("mine.toml");
     let preset = concat!(
         env!("CARGO_MANIFEST_DIR"),
@@ -219,10 +201,9 @@ fn a_changed_layout_and_a_locked_directory_are_refused() {
     );
     fs::copy(preset, &layout).expect("a preset");
     let layout_key = format!("data.layout={}", layout.display());
-    let args = ["--set", "train.steps=3", "--set", &layout_key];
+    let args = ["--set=train.steps=3", "--set", &layout_key];
     let resume = [&args[..], &["--resume"]].concat();
-    let output = train(&config, &run, &args);
-    assert!(output.status.success(), "{}", stderr(&output));
+    trained(&config, &run, &args);
     assert!(
         run.join("layout.toml").is_file(),
         "the run has a copy of the layout"
@@ -233,9 +214,9 @@ fn a_changed_layout_and_a_locked_directory_are_refused() {
     assert_ne!(swapped, text);
     fs::write(&layout, swapped).expect("a layout");
     let error = error_line(&train(&config, &run, &resume), 1);
-    assert!(
-        error.contains("network, layout or statistics of the checkpoint differ"),
-        "{error}"
+    says(
+        &error,
+        "network, layout or statistics of the checkpoint differ",
     );
     let kept = fs::read_to_string(run.join("layout.toml")).expect("the run's layout");
     assert!(

@@ -7,14 +7,14 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{assert_same_run, command, config, metrics, stderr, train, wait_until};
+use common::{assert_same_run, command, config, metrics, place, stderr, trained, wait_until};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGKILL, SIGTERM};
 
 const KILLS: usize = 40;
 /// A checkpoint after each step, so that most of the time is spent on writing.
-const EVERY_STEP: [&str; 2] = ["--set", "run.checkpoint_every=1"];
+const EVERY_STEP: [&str; 1] = ["--set=run.checkpoint_every=1"];
 
 fn send(child: &Child, signal: i32) {
     let status = Command::new("kill")
@@ -55,8 +55,7 @@ fn runs_killed_dozens_of_times_equal_an_uninterrupted_one() {
     let config = config(dir.path());
     let whole = dir.path().join("whole");
     let started = Instant::now();
-    let output = train(&config, &whole, &EVERY_STEP);
-    assert!(output.status.success(), "{}", stderr(&output));
+    trained(&config, &whole, &EVERY_STEP);
     let duration = started.elapsed();
 
     let mut rng = ChaCha8Rng::seed_from_u64(4);
@@ -103,10 +102,8 @@ fn the_first_signal_saves_a_checkpoint_and_stops() {
         let run = dir.path().join(name);
         // The only checkpoint is that of the signal.
         let long = [
-            "--set",
-            "train.steps=100000",
-            "--set",
-            "run.checkpoint_every=100000",
+            "--set=train.steps=100000",
+            "--set=run.checkpoint_every=100000",
         ];
         let mut child = start(&config, &run, &long);
         wait_for_a_line(&mut child, &run);
@@ -125,18 +122,12 @@ fn the_first_signal_saves_a_checkpoint_and_stops() {
 /// checkpoint.
 #[test]
 fn the_second_signal_stops_at_once() {
-    let dir = tempfile::tempdir().expect("a temporary directory");
-    let config = config(dir.path());
-    let run = dir.path().join("run");
+    let (_dir, config, run) = place();
     let long = [
-        "--set",
-        "train.steps=100000",
-        "--set",
-        "run.checkpoint_every=100000",
-        "--set",
-        "train.grad_accumulation=300",
-        "--set",
-        "run.log_every=1",
+        "--set=train.steps=100000",
+        "--set=run.checkpoint_every=100000",
+        "--set=train.grad_accumulation=300",
+        "--set=run.log_every=1",
     ];
     let mut child = start(&config, &run, &long);
     wait_for_a_line(&mut child, &run);
@@ -155,15 +146,11 @@ fn checkpoint_minutes_write_checkpoints() {
     let run = dir.path().join("run");
     // A hundredth of a second.
     let sets = [
-        "--set",
-        "run.checkpoint_every=1000",
-        "--set",
-        "run.checkpoint_minutes=0.00016",
-        "--set",
-        "run.keep=100",
+        "--set=run.checkpoint_every=1000",
+        "--set=run.checkpoint_minutes=0.00016",
+        "--set=run.keep=100",
     ];
-    let output = train(&config(dir.path()), &run, &sets);
-    assert!(output.status.success(), "{}", stderr(&output));
+    trained(&config(dir.path()), &run, &sets);
     let count = std::fs::read_dir(run.join("checkpoints"))
         .expect("checkpoints")
         .count();

@@ -5,21 +5,16 @@ mod common;
 use std::fs;
 use std::process::Stdio;
 
-use common::{command, config, error_line, metrics, stderr, train, wait_until};
+use common::{command, config, error_line, metrics, place, says, train, trained, wait_until};
 
 /// A learning rate at which the first step diverges.
-const EXPLODE: [&str; 4] = [
-    "--set",
-    "optimizer.lr_start=1e30",
-    "--set",
-    "data.validation=0",
-];
+const EXPLODE: [&str; 2] = ["--set=optimizer.lr_start=1e30", "--set=data.validation=0"];
 
 #[test]
 fn a_non_finite_loss_stops_the_run_and_names_its_patches() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let run = dir.path().join("run");
-    let args = [&EXPLODE[..], &["--set", "run.checkpoint_every=1"]].concat();
+    let args = [&EXPLODE[..], &["--set=run.checkpoint_every=1"]].concat();
     let error = error_line(&train(&config(dir.path()), &run, &args), 1);
     for words in [
         "step 2: non-finite loss or gradient: loss ",
@@ -40,10 +35,8 @@ fn a_non_finite_loss_stops_the_run_and_names_its_patches() {
 
 #[test]
 fn skipped_steps_are_counted_and_too_many_end_the_run() {
-    let dir = tempfile::tempdir().expect("a temporary directory");
-    let config = config(dir.path());
-    let run = dir.path().join("run");
-    let skip = ["--set", "train.on_nan=skip", "--set", "train.steps=120"];
+    let (_dir, config, run) = place();
+    let skip = ["--set=train.on_nan=skip", "--set=train.steps=120"];
     let output = train(&config, &run, &[&EXPLODE[..], &skip].concat());
     let error = error_line(&output, 1);
     assert!(
@@ -51,9 +44,9 @@ fn skipped_steps_are_counted_and_too_many_end_the_run() {
         "{error}"
     );
     let text = String::from_utf8_lossy(&output.stdout);
-    assert!(
-        text.contains("warning: step 2: non-finite loss or gradient, skipped: "),
-        "{text}"
+    says(
+        &text,
+        "warning: step 2: non-finite loss or gradient, skipped: ",
     );
     let lines = metrics(&run);
     assert_eq!(lines[0]["skipped"], 1, "of two steps");
@@ -63,31 +56,16 @@ fn skipped_steps_are_counted_and_too_many_end_the_run() {
 
 #[test]
 fn a_stopped_run_may_resume_and_skip() {
-    let dir = tempfile::tempdir().expect("a temporary directory");
-    let config = config(dir.path());
-    let run = dir.path().join("run");
-    assert!(
-        train(&config, &run, &["--set", "train.steps=3"])
-            .status
-            .success()
-    );
-    let args = [
-        "--set",
-        "train.steps=3",
-        "--resume",
-        "--set",
-        "train.on_nan=skip",
-    ];
-    let output = train(&config, &run, &args);
-    assert!(output.status.success(), "{}", stderr(&output));
+    let (_dir, config, run) = place();
+    trained(&config, &run, &["--set=train.steps=3"]);
+    let args = ["--set=train.steps=3", "--resume", "--set=train.on_nan=skip"];
+    trained(&config, &run, &args);
 }
 
 #[test]
 fn a_second_process_in_the_directory_is_refused() {
-    let dir = tempfile::tempdir().expect("a temporary directory");
-    let config = config(dir.path());
-    let run = dir.path().join("run");
-    let long = ["--set", "train.steps=100000"];
+    let (_dir, config, run) = place();
+    let long = ["--set=train.steps=100000"];
     let mut first = command(&config, &run, &long)
         .stdout(Stdio::null())
         .spawn()
@@ -97,10 +75,7 @@ fn a_second_process_in_the_directory_is_refused() {
         &train(&config, &run, &[&long[..], &["--resume"]].concat()),
         1,
     );
-    assert!(
-        error.contains("in use by another training process"),
-        "{error}"
-    );
+    says(&error, "in use by another training process");
     let lines = metrics(&run).len();
     wait_until(|| metrics(&run).len() > lines + 1);
     assert!(first.try_wait().expect("a child").is_none());
@@ -110,21 +85,15 @@ fn a_second_process_in_the_directory_is_refused() {
 
 #[test]
 fn incomplete_files_of_a_killed_process_are_removed() {
-    let dir = tempfile::tempdir().expect("a temporary directory");
-    let config = config(dir.path());
-    let run = dir.path().join("run");
-    let set = ["--set", "train.steps=3"];
-    assert!(train(&config, &run, &set).status.success());
+    let (_dir, config, run) = place();
+    let set = ["--set=train.steps=3"];
+    trained(&config, &run, &set);
     let left = [".best.safetensors.123.tmp", "strips/.test.png.123.tmp"];
     for name in left {
         fs::write(run.join(name), "half").expect("a file");
     }
     fs::write(run.join(".notes"), "mine").expect("a file");
-    assert!(
-        train(&config, &run, &[&set[..], &["--resume"]].concat())
-            .status
-            .success()
-    );
+    trained(&config, &run, &[&set[..], &["--resume"]].concat());
     assert!(left.iter().all(|name| !run.join(name).exists()));
     assert!(run.join(".notes").exists());
 }

@@ -36,7 +36,6 @@ pub(super) struct BlockReader<R> {
     pub(super) kept: DecodedBlocks,
 }
 
-/// Column and row of a block.
 pub(super) type BlockPosition = (usize, usize);
 
 enum LoadedBlock {
@@ -55,7 +54,6 @@ pub(super) struct BlockGrid {
 }
 
 impl BlockGrid {
-    /// The block that holds this pixel.
     pub(super) fn place(&self, pixel: Vec2<usize>) -> BlockPosition {
         let Vec2(column, row) = pixel / self.block;
         (column, row)
@@ -232,13 +230,11 @@ impl<R: Read + Seek> BlockReader<R> {
     }
 }
 
-/// Part and position.
 type BlockKey = (usize, BlockPosition);
 
 /// Decoded blocks of some parts, up to a memory limit.
 #[derive(Default)]
 pub(super) struct DecodedBlocks {
-    /// The parts whose blocks are kept.
     parts: Vec<usize>,
     blocks: HashMap<BlockKey, UncompressedBlock>,
     bytes: usize,

@@ -95,7 +95,6 @@ pub(super) struct RewritePlan {
 }
 
 pub(super) struct PlannedPart {
-    /// The part's index in the input.
     pub(super) input: usize,
     /// Its channels, in the order of the header; `None` if the blocks of the input are copied.
     pub(super) channels: Option<Vec<ChannelOrigin>>,
@@ -109,7 +108,6 @@ pub(super) struct ChannelOrigin {
 }
 
 impl RewritePlan {
-    /// Plans the output for a denoised colour of `samples` samples.
     pub(super) fn new<R: Read + Seek>(
         file: &ExrFile<R>,
         layout: &ChannelLayout,
@@ -142,7 +140,6 @@ impl RewritePlan {
     }
 }
 
-/// The channels in the file that the layout names as colour.
 fn color_channels<'a, R: Read + Seek>(
     file: &'a ExrFile<R>,
     layout: &ChannelLayout,

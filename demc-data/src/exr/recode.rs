@@ -116,7 +116,6 @@ impl<R: Read + Seek> Recoder<'_, R> {
         Ok(())
     }
 
-    /// Encodes a part again.
     fn code<W: Write + Seek>(
         &mut self,
         part: usize,
@@ -147,14 +146,12 @@ impl<R: Read + Seek> Recoder<'_, R> {
 }
 
 struct OutputBlock {
-    /// Its index in the table of blocks.
     index: usize,
     tile: TileCoordinates,
     corner: Vec2<usize>,
     size: Vec2<usize>,
 }
 
-/// The blocks of a part, in file order.
 fn targets(header: &Header) -> Result<Vec<OutputBlock>, ExrError> {
     let blocks = header.enumerate_ordered_blocks();
     let targets = blocks.map(|(index, tile)| {
@@ -228,9 +225,7 @@ fn compress(
 }
 
 enum ChannelContent {
-    /// A plane of the denoised colour.
     Color(usize),
-    /// A channel of the input.
     Carried(SampleSpan),
 }
 

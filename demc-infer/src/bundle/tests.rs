@@ -16,6 +16,10 @@ const STYLES: [(Names, Precision); 4] = [
     (Names::Torch, Precision::F16),
 ];
 
+fn encoded(bundle: &Bundle, names: Names, precision: Precision) -> Vec<u8> {
+    encode::encode(&bundle.meta, bundle.model.weights(), names, precision).expect("bytes")
+}
+
 type TensorList = Vec<(String, Dtype, Vec<usize>, Vec<u8>)>;
 
 fn load_error(tensors: &TensorList, header: Option<&str>) -> String {
@@ -47,13 +51,7 @@ fn error_of(bytes: &[u8]) -> String {
 
 fn good() -> (TensorList, String) {
     let bundle = bundle(Variant::Demc);
-    let bytes = encode::encode(
-        &bundle.meta,
-        bundle.model.weights(),
-        Names::Burn,
-        Precision::F32,
-    )
-    .expect("bytes");
+    let bytes = encoded(&bundle, Names::Burn, Precision::F32);
     let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).expect("header");
     let entry = header.metadata().as_ref().expect("metadata")["demc"].clone();
     let tensors = safetensors::SafeTensors::deserialize(&bytes).expect("tensors");
@@ -90,13 +88,7 @@ fn every_naming_and_precision_survives_a_round_trip() {
 #[test]
 fn f16_halves_the_convolutions_and_leaves_batch_normalisation() {
     let bundle = bundle(Variant::Demc);
-    let bytes = encode::encode(
-        &bundle.meta,
-        bundle.model.weights(),
-        Names::Torch,
-        Precision::F16,
-    )
-    .expect("bytes");
+    let bytes = encoded(&bundle, Names::Torch, Precision::F16);
     let tensors = safetensors::SafeTensors::deserialize(&bytes).expect("tensors");
     let dtype = |name: &str| tensors.tensor(name).expect(name).dtype();
     assert_eq!(dtype("decoder.head.weight"), Dtype::F16);
@@ -108,13 +100,7 @@ fn f16_halves_the_convolutions_and_leaves_batch_normalisation() {
 fn equal_bundles_give_equal_bytes() {
     let bytes = || {
         let bundle = bundle(Variant::Semc);
-        encode::encode(
-            &bundle.meta,
-            bundle.model.weights(),
-            Names::Burn,
-            Precision::F16,
-        )
-        .expect("bytes")
+        encoded(&bundle, Names::Burn, Precision::F16)
     };
     let first = bytes();
     assert!((0..8).all(|_| bytes() == first));
@@ -123,13 +109,7 @@ fn equal_bundles_give_equal_bytes() {
 #[test]
 fn a_file_cut_short_anywhere_is_refused() {
     let bundle = bundle(Variant::Demc);
-    let bytes = encode::encode(
-        &bundle.meta,
-        bundle.model.weights(),
-        Names::Burn,
-        Precision::F32,
-    )
-    .expect("bytes");
+    let bytes = encoded(&bundle, Names::Burn, Precision::F32);
     for length in [0, 7, 100, bytes.len() / 2, bytes.len() - 1] {
         let error = error_of(&bytes[..length]);
         assert!(

@@ -79,7 +79,6 @@ impl Clamped {
         self.images += usize::from(samples > 0);
     }
 
-    /// Prints a note on stderr if any value was negative.
     fn report(self) {
         let Self { samples, images } = self;
         if samples > 0 {

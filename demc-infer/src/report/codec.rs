@@ -15,7 +15,6 @@ use rayon::prelude::*;
 pub const WHITE: f32 = 8.0;
 /// Inverse of the value below which the curve is linear.
 pub const TOE: f32 = 64.0;
-/// Qualities, best first.
 const QUALITIES: [u8; 8] = [92, 84, 74, 62, 50, 38, 26, 16];
 /// Lowest quality with chroma in full resolution.
 const FULL_CHROMA: u8 = 84;

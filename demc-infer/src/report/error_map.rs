@@ -110,7 +110,6 @@ fn cropped(plane: &[f32], width: usize, patch: &ErrorPatch) -> impl Iterator<Ite
     lines.flat_map(move |line| line[columns.clone()].iter().copied())
 }
 
-/// An error on the colour scale, 0 to 255.
 fn shade(error: f32) -> u8 {
     let [low, high] = SCALE;
     let position = (error.max(low) / low).log10() / (high / low).log10();

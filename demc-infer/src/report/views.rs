@@ -45,7 +45,6 @@ pub struct Pictures {
     patches: [Inset; 2],
 }
 
-/// A part of the scene at full resolution.
 #[derive(Serialize)]
 struct Inset {
     kind: &'static str,
@@ -180,9 +179,7 @@ impl Inset {
 
 /// Distributes a scene's bytes over its pictures.
 struct ByteBudget {
-    /// Bytes for the remaining pictures.
     left: usize,
-    /// Shares of the remaining pictures.
     shares: usize,
     /// Worst and best quality so far.
     quality: [u8; 2],

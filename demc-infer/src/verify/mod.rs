@@ -26,7 +26,6 @@ const NO_PACKAGE: i32 = 3;
 const SCRIPT: &str = include_str!("run.py");
 /// Share of black pixels of a synthetic frame: paths that found no light.
 const BLACK: f32 = 0.3;
-/// Share of fireflies.
 const FIREFLIES: f32 = 0.005;
 /// Radiance of fireflies, as powers of ten.
 const FIREFLY_EXPONENTS: std::ops::Range<f32> = 1.0..3.0;

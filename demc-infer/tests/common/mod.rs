@@ -97,6 +97,12 @@ pub fn export(model: &Path, file: &Path, flags: &[&str]) -> Outcome {
 }
 
 impl Outcome {
+    /// Fails the test unless stdout or stderr contains `words`.
+    pub fn says(&self, words: &str) {
+        let all = [&*self.stdout, &self.stderr].concat();
+        assert!(all.contains(words), "{words}: {all}");
+    }
+
     /// Fails the test unless the exit code is 0.
     pub fn success(self) -> Self {
         assert_eq!(self.code, 0, "{}", self.stderr);

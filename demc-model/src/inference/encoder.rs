@@ -226,7 +226,6 @@ impl InferencePass<'_> {
 
 pub(super) struct BandedLevel<'a> {
     pub(super) chain: ConvChain<'a>,
-    /// Number of convolutions before the skip.
     skip_after: usize,
 }
 

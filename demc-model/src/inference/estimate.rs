@@ -15,7 +15,6 @@ const VALUE: usize = size_of::<f32>();
 /// Values of a transformed Winograd tile, F(4x4, 3x3).
 const TILE_VALUES: usize = 36;
 
-/// Output pixels of a tile.
 const TILE_PIXELS: usize = 16;
 
 /// Largest number of tiles that a thread transforms at a time where weights, and so this memory,
@@ -99,7 +98,6 @@ impl PeakEstimate<'_> {
         }
     }
 
-    /// Channels of the widest encoder's input.
     fn first_input(&self) -> usize {
         let inputs = self.config.variant.spec().encoders.iter();
         let channels = inputs.map(|inputs| channels_of(inputs));
@@ -118,7 +116,6 @@ impl PeakEstimate<'_> {
         self.config.variant.spec().has_fusion()
     }
 
-    /// The detail map, if there is one.
     fn detail(&self) -> usize {
         match self.has_fusion() {
             true => self.grid.pixels() * DETAIL_CHANNELS,

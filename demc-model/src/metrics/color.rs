@@ -35,13 +35,11 @@ pub(super) fn linear_from_srgb(x: f32) -> f32 {
     }
 }
 
-/// YCxCz of linear RGB.
 pub(super) fn opponent_from_linear(rgb: Color) -> Color {
     let [x, y, z] = white_relative(rgb);
     [116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)]
 }
 
-/// Linear RGB of YCxCz.
 pub(super) fn linear_from_opponent([y, cx, cz]: Color) -> Color {
     let y = (y + 16.0) / 116.0;
     let xyz = [y + cx / 500.0, y, y - cz / 200.0];
@@ -68,7 +66,6 @@ pub(super) fn hunt_lab_from_linear(rgb: Color) -> Color {
     [l, hunt * 500.0 * (x - y), hunt * 200.0 * (y - z)]
 }
 
-/// The HyAB distance of two L*a*b* colours.
 pub(super) fn hyab(a: Color, b: Color) -> f32 {
     let [l, x, y] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
     l.abs() + (x * x + y * y).sqrt()

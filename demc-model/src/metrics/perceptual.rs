@@ -92,7 +92,6 @@ fn add_moments(sums: &mut [Vec<f64>; MOMENTS], x: &[f64], y: &[f64], tap: f64) {
     }
 }
 
-/// Sum of SSIM over a row of windows.
 #[multiversion(targets("x86_64+avx512f", "x86_64+avx2"))]
 fn ssim_row([mean_x, mean_y, xx, yy, xy]: &[Vec<f64>; MOMENTS]) -> f64 {
     const C1: f64 = 0.01 * 0.01;

@@ -13,8 +13,8 @@ use super::compute::{ComputeArguments, stopped};
 /// Train variants with several seeds each and compare them on the test split
 ///
 /// The file names a base configuration, seeds and variants (see configs/ablation.toml). Rerun the
-/// command to resume an ablation: complete runs are not repeated. Writes ablation.md, .csv, .json
-/// and .svg to the directory of the ablation.
+/// command to resume an ablation: complete runs are not repeated. Writes ablation.md, .csv and
+/// .json to the directory of the ablation.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// File of the ablation

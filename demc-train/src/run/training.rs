@@ -199,7 +199,6 @@ impl TrainingRun {
         Ok(LoopEnd::Done)
     }
 
-    /// Opens the run directory and the records in it.
     fn open_records(&mut self, device: &str) -> anyhow::Result<Recorder> {
         let facts = RunFacts {
             device,
@@ -216,7 +215,6 @@ impl TrainingRun {
         Ok(recorder)
     }
 
-    /// Adds a step to the state; returns its warnings.
     fn count(
         &mut self,
         report: &StepReport,

@@ -23,7 +23,6 @@ const LARGE_BATCH: usize = 4;
 /// is a small part of it.
 const LONG_STEP: f64 = 30.0;
 
-/// Number of timed steps; the first ones find cold caches (ours).
 const REPETITIONS: u32 = 6;
 /// Seconds after which timing stops, so that the run starts soon (ours).
 const TIME_LIMIT: f64 = 1.0;

@@ -122,7 +122,6 @@ pub fn sweep(
 #[derive(Default)]
 struct SweepRatios {
     points: Vec<SweepPoint>,
-    /// Weighted sum of the ratios, and sum of the weights.
     sums: (f64, f64),
     least: Option<f64>,
 }
@@ -224,7 +223,7 @@ impl Sweep {
         let marks = self
             .suggestion()
             .map(|lr| (lr, format!("suggested: {lr:.1e}")));
-        Figure::Lines(vec![LinePanel {
+        Figure(vec![LinePanel {
             title: "learning-rate sweep".into(),
             x_label: "learning rate".into(),
             y_label: "loss / loss of the untrained network".into(),

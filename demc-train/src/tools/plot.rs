@@ -49,7 +49,7 @@ pub fn plot(runs: &[PathBuf], stem: &Path, options: &PlotOptions) -> anyhow::Res
     let logs = runs.iter().map(|run| log(&run.join(METRICS)));
     let logs: Vec<_> = logs.collect::<anyhow::Result<_>>()?;
     let named: Vec<_> = names.iter().zip(&logs).collect();
-    Figure::Lines(panels(&named, options)).write(stem)
+    Figure(panels(&named, options)).write(stem)
 }
 
 fn log(path: &Path) -> anyhow::Result<Vec<LoggedValues>> {

@@ -31,12 +31,8 @@ pub fn config(dir: &Path) -> PathBuf {
 /// `demc-train --config CONFIG --run-dir RUN ARGS...`
 pub fn command(config: &Path, run: &Path, args: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_demc-train"));
-    command
-        .arg("--config")
-        .arg(config)
-        .arg("--run-dir")
-        .arg(run)
-        .args(args);
+    command.args([Path::new("--config"), config, Path::new("--run-dir"), run]);
+    command.args(args);
     command
 }
 
@@ -45,6 +41,20 @@ pub fn train(config: &Path, run: &Path, args: &[&str]) -> Output {
     command(config, run, args)
         .output()
         .expect("the binary runs")
+}
+
+/// Runs `demc-train`, which must succeed.
+pub fn trained(config: &Path, run: &Path, args: &[&str]) -> Output {
+    let output = train(config, run, args);
+    assert!(output.status.success(), "{}", stderr(&output));
+    output
+}
+
+/// A temporary directory, a [`config`] in it, and the path of a run.
+pub fn place() -> (tempfile::TempDir, PathBuf, PathBuf) {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let (config, run) = (config(dir.path()), dir.path().join("run"));
+    (dir, config, run)
 }
 
 /// Standard error as text.
@@ -59,6 +69,11 @@ pub fn error_line(output: &Output, code: i32) -> String {
     assert_eq!(text.lines().count(), 1, "one line: {text}");
     assert!(text.starts_with("error: "), "{text}");
     text
+}
+
+/// Fails unless `text` contains `words`.
+pub fn says(text: &str, words: &str) {
+    assert!(text.contains(words), "{words}: {text}");
 }
 
 /// `metrics.jsonl` without the values that depend on the clock.

@@ -191,7 +191,6 @@ pub(super) fn contiguous(tensor: FlexTensor) -> FlexTensor {
     tensor.to_contiguous()
 }
 
-/// The values of a [`contiguous`] tensor.
 pub(super) fn values(tensor: &FlexTensor) -> &[f32] {
     tensor.storage::<f32>()
 }

@@ -1,4 +1,4 @@
-//! A comparison as Markdown, CSV, JSON and a figure (as the paper's Fig. 10).
+//! A comparison as Markdown, CSV and JSON.
 
 use std::fmt::Write as _;
 use std::io::Write;
@@ -8,18 +8,12 @@ use anyhow::Context;
 use demc_data::file::write_whole;
 
 use super::comparison::{Comparison, VariantScores};
-use crate::tools::chart::figure::{AxisScale, Bar, BarPanel, Figure};
 use demc_infer::statistics::{Estimate, RESAMPLES};
 
 /// Name of all files, without extension.
 const STEM: &str = "ablation";
 const MEGAPIXEL: f64 = 1e6;
 const GIGA: f64 = 1e9;
-
-const NO_DIFFERENCE: Estimate = Estimate {
-    mean: 0.0,
-    interval: [0.0; 2],
-};
 
 pub(super) fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<Vec<PathBuf>> {
     std::fs::create_dir_all(dir).with_context(|| dir.display().to_string())?;
@@ -34,7 +28,6 @@ pub(super) fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<Vec<P
         write_whole(&path, |file| file.write_all(text.as_bytes()))?;
         paths.push(path);
     }
-    paths.push(figure(comparison).write(&dir.join(STEM))?);
     Ok(paths)
 }
 
@@ -170,47 +163,6 @@ fn csv(comparison: &Comparison) -> String {
         );
     }
     text
-}
-
-/// RelMSE and SSIM with a dot per seed, and their paired differences.
-fn figure(comparison: &Comparison) -> Figure {
-    type ReadScore = fn(&VariantScores) -> Option<(Estimate, &[f64])>;
-    let panel = |title: String, value: ReadScore| {
-        let bars = comparison.rows.iter().filter_map(|row| {
-            let (Estimate { mean, interval }, seeds) = value(row)?;
-            let bar = Bar {
-                value: mean,
-                interval: Some(interval.into()),
-                points: seeds.to_vec(),
-            };
-            Some((row.name.clone(), bar))
-        });
-        let (names, bars): (Vec<_>, Vec<_>) = bars.unzip();
-        (!bars.is_empty()).then(|| BarPanel {
-            y_label: title.clone(),
-            title,
-            names,
-            bars,
-            y: AxisScale::Linear,
-        })
-    };
-    let first = comparison.rows.first().map_or("", |row| &row.name);
-    let panels = [
-        panel("RelMSE (lower is better)".into(), |row| {
-            Some((row.relmse, &row.relmse_of_seeds))
-        }),
-        panel("SSIM (higher is better)".into(), |row| {
-            Some((row.ssim?, &row.ssim_of_seeds))
-        }),
-        panel(format!("RelMSE minus that of {first}, paired"), |row| {
-            Some((row.relmse_difference.unwrap_or(NO_DIFFERENCE), &[]))
-        }),
-        panel(format!("SSIM minus that of {first}, paired"), |row| {
-            row.ssim?;
-            Some((row.ssim_difference.unwrap_or(NO_DIFFERENCE), &[]))
-        }),
-    ];
-    Figure::Bars(panels.into_iter().flatten().collect())
 }
 
 #[cfg(test)]

@@ -45,7 +45,6 @@ pub(super) fn font(size: f64) -> FontDesc<'static> {
     FontDesc::new(FontFamily::SansSerif, size, FontStyle::Normal)
 }
 
-/// Text centred on its point.
 pub(super) fn text_style(color: RGBColor) -> TextStyle<'static> {
     let middle = Pos::new(HPos::Center, VPos::Center);
     font(SIZES[1]).color(&color).pos(middle)
@@ -57,15 +56,11 @@ pub(super) fn width(text: &str) -> i32 {
     (text.chars().count() as f64 * CHARACTER * SIZES[1] * POINTS).ceil() as i32
 }
 
-/// Draws title, axes, labels and grid of a panel and returns it, or draws "no data" without an
-/// axis.
-///
-/// Without `x_label` the x axis has neither numbers nor grid lines.
+/// Draws title, axes, labels (of x and y) and grid of a panel and returns it, or draws "no data"
+/// without an axis.
 pub(super) fn chart<'c, B: DrawingBackend>(
     area: &Area<B>,
-    title: &str,
-    x_label: Option<&str>,
-    y_label: &str,
+    [title, x_label, y_label]: [&str; 3],
     axes: (Option<Axis>, Option<Axis>),
 ) -> DrawResult<Option<Chart<'c, B>>, B> {
     let title_style = font(SIZES[0]).color(&INK);
@@ -87,11 +82,11 @@ pub(super) fn chart<'c, B: DrawingBackend>(
         .build_cartesian_2d(x, y)?;
     let mut mesh = chart.configure_mesh();
     mesh.set_all_tick_mark_size(8)
-        .x_labels(x_label.map_or(0, |_| x_most))
+        .x_labels(x_most)
         .y_labels(y_most)
         .label_style(text_style(INK))
         .y_label_offset(LOWER)
-        .x_desc(x_label.unwrap_or_default())
+        .x_desc(x_label)
         .y_desc(y_label)
         .axis_style(GREY.stroke_width(2))
         .bold_line_style(GRID[0].stroke_width(2))

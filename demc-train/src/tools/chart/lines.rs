@@ -34,8 +34,8 @@ pub(super) fn draw<B: DrawingBackend>(area: &Area<B>, panel: &LinePanel) -> Draw
     let above = MARGINS[0] + MARGINS[1] * marks.clone().count() as f64;
     let ys = shown().map(|point| point.1);
     let y = Axis::over(panel.y, ys, [MARGINS[0], above]);
-    let x_label = Some(&*panel.x_label);
-    let chart = frame::chart(area, &panel.title, x_label, &panel.y_label, (x, y))?;
+    let labels = [&*panel.title, &panel.x_label, &panel.y_label];
+    let chart = frame::chart(area, labels, (x, y))?;
     let Some(mut chart) = chart else {
         return Ok(());
     };

@@ -1,11 +1,9 @@
-//! Charts as SVG: lines over steps, bars with intervals.
+//! Charts as SVG: lines over steps or learning rates.
 //!
 //! `plotters` draws axes, meshes, series and legends. This module adds the range and labels of axes
-//! (`axis`), the contents of a panel (`lines`, `bars`), its `frame`, and the layout of panels
-//! (`page`). Text uses the viewer's `sans-serif` font, so no font is read here.
+//! (`axis`), the contents of a panel (`lines`), its `frame`, and the layout of panels (`page`). Text uses the viewer's `sans-serif` font, so no font is read here.
 
 mod axis;
-mod bars;
 pub mod figure;
 mod frame;
 mod lines;

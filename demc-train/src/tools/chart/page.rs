@@ -6,7 +6,7 @@ use super::figure::Figure;
 use super::frame::{
     Area, EDGE, INK, LOWER, LegendEntries, ROW, SIZES, chart, font, palette, width,
 };
-use super::{bars, lines};
+use super::lines;
 
 /// Length of the sample line in a legend.
 const SAMPLE: i32 = 44;
@@ -21,10 +21,7 @@ pub(super) struct FigurePage<'a> {
 
 impl<'a> FigurePage<'a> {
     pub(super) fn new(figure: &'a Figure) -> Self {
-        let entries: Vec<LegendEntries> = match figure {
-            Figure::Lines(panels) => panels.iter().map(lines::entries).collect(),
-            Figure::Bars(panels) => panels.iter().map(bars::entries).collect(),
-        };
+        let entries: Vec<LegendEntries> = figure.0.iter().map(lines::entries).collect();
         let (columns, panel) = match entries.len() {
             0 | 1 => (1, (1552, 900)),
             2 | 4 => (2, (1000, 760)),
@@ -57,11 +54,10 @@ impl<'a> FigurePage<'a> {
         root.fill(&WHITE)?;
         let (areas, beside) = root.split_horizontally(self.grid.1 as u32 * self.panel.0);
         for (i, area) in areas.split_evenly(self.grid).iter().enumerate() {
-            match self.figure {
-                Figure::Lines(panels) if i < panels.len() => lines::draw(area, &panels[i])?,
-                Figure::Bars(panels) if i < panels.len() => bars::draw(area, &panels[i])?,
-                _ if i == 0 => drop(chart(area, "", None, "", (None, None))?),
-                _ => {}
+            match self.figure.0.get(i) {
+                Some(panel) => lines::draw(area, panel)?,
+                None if i == 0 => drop(chart(area, ["", "", ""], (None, None))?),
+                None => {}
             }
         }
         self.draw_legend(&beside)?;
@@ -73,16 +69,12 @@ impl<'a> FigurePage<'a> {
         if self.legend.is_empty() {
             return Ok(());
         }
-        let width = match self.figure {
-            Figure::Lines(_) => 5,
-            Figure::Bars(_) => 22,
-        };
         let mut builder = ChartBuilder::on(area);
         let mut chart = builder
             .margin_top(3 * EDGE)
             .build_cartesian_2d(0..1, 0..1)?;
         for (name, color) in &self.legend {
-            let style = palette(*color).stroke_width(width);
+            let style = palette(*color).stroke_width(5);
             let series = chart.draw_series(LineSeries::new([(0, 0); 0], style))?;
             series.label(name).legend(move |(x, y)| {
                 let y = y - LOWER / 2;

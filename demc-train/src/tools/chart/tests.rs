@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use super::figure::{AxisScale, Bar, BarPanel, LinePanel, Series};
+use super::figure::{AxisScale, LinePanel, Series};
 use super::frame::palette;
 use super::*;
 
@@ -24,21 +24,6 @@ fn panel(y: AxisScale, series: Vec<Series>) -> LinePanel {
         y,
         series,
         marks: vec![(1.5, "chosen".to_string())],
-    }
-}
-
-fn bars(names: &[&str], values: &[f64]) -> BarPanel {
-    let bar = |value: &f64| Bar {
-        value: *value,
-        interval: Some((0.99 * value, 1.01 * value)),
-        points: vec![*value],
-    };
-    BarPanel {
-        title: "bars".to_string(),
-        y_label: String::new(),
-        names: names.iter().map(|name| name.to_string()).collect(),
-        bars: values.iter().map(bar).collect(),
-        y: AxisScale::Linear,
     }
 }
 
@@ -70,7 +55,6 @@ fn attributes(svg: &str, element: &str, color: RGBColor, name: &str) -> Vec<i32>
         .collect()
 }
 
-/// How many text elements of the SVG are exactly `word`.
 fn says(svg: &str, word: &str) -> usize {
     svg.lines().filter(|line| *line == word).count()
 }
@@ -97,7 +81,7 @@ fn lines_go_through_their_points() {
         series("up <1>", 0, &rising),
         series("down", 1, &[(0.0, 100.0), (3.0, 0.1)]),
     ];
-    let svg = written(&Figure::Lines(vec![panel(AxisScale::Log, lines)]));
+    let svg = written(&Figure(vec![panel(AxisScale::Log, lines)]));
     let [up, down] = ["#0072B2", "#D55E00"].map(|color| stretches(&svg, color).remove(0));
     let (x, y): (Vec<_>, Vec<_>) = up.iter().copied().unzip();
     assert!(x.is_sorted() && y.is_sorted_by(|a, b| a > b), "{up:?}");
@@ -144,7 +128,7 @@ fn points_that_cannot_be_shown_leave_a_gap() {
     ];
     let zeros = points.map(|(x, y)| (x, if y.is_nan() { 0.0 } else { y }));
     let lengths = |y, points: &[_]| -> Vec<usize> {
-        let figure = Figure::Lines(vec![panel(y, vec![series("a", 0, points)])]);
+        let figure = Figure(vec![panel(y, vec![series("a", 0, points)])]);
         stretches(&written(&figure), "#0072B2")
             .iter()
             .map(Vec::len)
@@ -162,7 +146,7 @@ fn faint_series_are_pale_and_not_in_the_legend() {
     let smooth = series("smooth", 2, &[(0.0, 1.0), (1.0, 2.0), (2.0, 1.5)]);
     let late = series("late", 10, &[(0.0, 4.0), (2.0, 4.0)]);
     let panel = panel(AxisScale::Linear, vec![smooth, raw, late]);
-    let svg = written(&Figure::Lines(vec![panel]));
+    let svg = written(&Figure(vec![panel]));
     assert_eq!(
         ["smooth", "raw", "late"].map(|name| says(&svg, name)),
         [1, 0, 1]
@@ -175,36 +159,6 @@ fn faint_series_are_pale_and_not_in_the_legend() {
 }
 
 #[test]
-fn bars_start_at_zero_unless_all_values_are_similar() {
-    let names = ["DEMC", "SEMC"];
-    let figure = |values| Figure::Bars(vec![bars(&names, values)]);
-    let svg = written(&figure(&[1.0, 3.0]));
-    let [first, second] = [0, 1].map(|i| attributes(&svg, "rect", palette(i), "height"));
-    assert!(
-        first[0] > 100 && (second[0] - 3 * first[0]).abs() <= 3,
-        "{first:?} {second:?}"
-    );
-    assert_eq!(
-        ["DEMC", "SEMC", "0", "2.5"].map(|word| says(&svg, word)),
-        [1; 4]
-    );
-    let svg = written(&figure(&[0.95, 0.91]));
-    assert_eq!(
-        ["0", "0.2", "0.92", "0.94"].map(|word| says(&svg, word)),
-        [0, 0, 1, 1]
-    );
-    for i in [0, 1] {
-        assert!(attributes(&svg, "rect", palette(i), "height").is_empty());
-        assert_eq!(
-            attributes(&svg, "polyline", palette(i), "stroke-width"),
-            [8]
-        );
-    }
-    let svg = written(&figure(&[f64::NAN, 3.0]));
-    assert_eq!(says(&svg, "n/a"), 1);
-}
-
-#[test]
 fn one_legend_names_each_series_once() {
     let line = |name| {
         panel(
@@ -213,38 +167,25 @@ fn one_legend_names_each_series_once() {
         )
     };
     let panels = vec![line("a"), line("a"), line("b")];
-    let svg = written(&Figure::Lines(panels));
+    let svg = written(&Figure(panels));
     assert_eq!([says(&svg, "a"), says(&svg, "b")], [1, 1]);
-    let names = [
-        "a variant with a name that is long",
-        "another long name of a variant",
-    ];
-    let svg = written(&Figure::Bars(vec![bars(&names, &[1.0, 2.0]); 3]));
-    assert_eq!(names.map(|name| says(&svg, name)), [1, 1]);
-    let names = ["DEMC", "SEMC"];
-    let svg = written(&Figure::Bars(vec![bars(&names, &[1.0, 2.0]); 3]));
-    assert_eq!(names.map(|name| says(&svg, name)), [3, 3], "below each bar");
 }
 
 #[test]
 fn single_points_are_dots_and_empty_panels_say_so() {
     let points = |points: &[_]| panel(AxisScale::Log, vec![series("a", 0, points)]);
-    let svg = written(&Figure::Lines(vec![points(&[(5.0, 0.2)])]));
+    let svg = written(&Figure(vec![points(&[(5.0, 0.2)])]));
     assert_eq!(says(&svg, "no data"), 0);
     assert_eq!(attributes(&svg, "circle", palette(0), "r"), [7]);
     let none = points(&[(1.0, 0.0), (2.0, f64::NAN)]);
-    for figure in [
-        Figure::Lines(vec![]),
-        Figure::Bars(vec![bars(&[], &[])]),
-        Figure::Lines(vec![none]),
-    ] {
+    for figure in [Figure(vec![]), Figure(vec![none])] {
         assert_eq!(says(&written(&figure), "no data"), 1);
     }
 }
 
 #[test]
 fn an_invalid_stem_is_named_and_writes_nothing() {
-    let figure = Figure::Lines(vec![]);
+    let figure = Figure(vec![]);
     let error = figure.write(Path::new("no/such/dir/chart")).unwrap_err();
     assert!(
         format!("{error:#}").contains("no/such/dir/chart.svg"),
@@ -262,7 +203,7 @@ fn an_invalid_stem_is_named_and_writes_nothing() {
 fn the_picture_has_room_for_the_longest_name() {
     let name = "runs/a-run-directory-with-a-long-name-24000-steps";
     let line = series(name, 0, &[(0.0, 1.0), (1.0, 2.0)]);
-    let svg = written(&Figure::Lines(vec![panel(AxisScale::Linear, vec![line])]));
+    let svg = written(&Figure(vec![panel(AxisScale::Linear, vec![line])]));
     let lines: Vec<&str> = svg.lines().collect();
     let label = lines.iter().position(|line| *line == name).unwrap() - 1;
     let [x, size]: [f64; 2] =

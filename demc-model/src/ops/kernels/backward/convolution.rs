@@ -76,53 +76,33 @@ fn backward_convolution<const P: usize, const N: usize>(
     }
 }
 
-#[derive(Debug)]
-pub(super) struct Conv3x3;
+/// Declares the backward pass of a kernel whose weight has the output channels on axis `$axis`.
+macro_rules! backward {
+    ($name:ident, $kernel:ident, $axis:literal) => {
+        #[derive(Debug)]
+        pub(super) struct $name;
 
-impl Backward<Flex, 3> for Conv3x3 {
-    type State = ConvState<1>;
+        impl Backward<Flex, 3> for $name {
+            type State = ConvState<1>;
 
-    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
-        backward_convolution(ops, grads, 0, |g| {
-            let ([x], [dx]) = (g.inputs, g.dinputs);
-            conv3x3::backward(
-                Isa::current(),
-                g.grid,
-                x,
-                g.weight,
-                g.y,
-                g.dy,
-                dx,
-                g.dweight,
-                g.dbias,
-            );
-        });
-    }
+            fn backward(
+                self,
+                ops: Ops<Self::State, 3>,
+                grads: &mut Gradients,
+                _: &mut Checkpointer,
+            ) {
+                backward_convolution(ops, grads, $axis, |g| {
+                    let ([x], [dx], isa) = (g.inputs, g.dinputs, Isa::current());
+                    let (dw, db) = (g.dweight, g.dbias);
+                    $kernel::backward(isa, g.grid, x, g.weight, g.y, g.dy, dx, dw, db);
+                });
+            }
+        }
+    };
 }
 
-#[derive(Debug)]
-pub(super) struct Deconv4x4;
-
-impl Backward<Flex, 3> for Deconv4x4 {
-    type State = ConvState<1>;
-
-    fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
-        backward_convolution(ops, grads, 1, |g| {
-            let ([x], [dx]) = (g.inputs, g.dinputs);
-            deconv4x4::backward(
-                Isa::current(),
-                g.grid,
-                x,
-                g.weight,
-                g.y,
-                g.dy,
-                dx,
-                g.dweight,
-                g.dbias,
-            );
-        });
-    }
-}
+backward!(Conv3x3, conv3x3, 0);
+backward!(Deconv4x4, deconv4x4, 1);
 
 /// A fusion of `P` parts. Its `N` nodes belong to the parts, the weight and the bias.
 #[derive(Debug)]
