@@ -99,9 +99,7 @@ impl Dataset {
     /// # Errors
     /// [`Error::Read`] without a manifest, otherwise [`Error::Dataset`] with all problems.
     pub fn open(root: &Path, layout: &ChannelLayout) -> Result<Self, Error> {
-        let path = root.join("manifest.json");
-        let text = std::fs::read_to_string(&path).map_err(|source| Error::Read { path, source })?;
-        let scenes = parse(root, &text).map_err(|problem| unusable(root, vec![problem]))?;
+        let scenes = Self::list(root)?;
         let mut problems = manifest_problems(&scenes);
         if layout.reference.is_none() {
             problems.push("the layout names no reference, which training needs".to_owned());
@@ -114,6 +112,16 @@ impl Dataset {
             }),
             false => Err(unusable(root, problems)),
         }
+    }
+
+    /// The scenes that `root/manifest.json` lists. Their files are not checked.
+    ///
+    /// # Errors
+    /// [`Error::Read`] without a manifest, [`Error::Dataset`] if it is malformed.
+    pub fn list(root: &Path) -> Result<Vec<Scene>, Error> {
+        let path = root.join("manifest.json");
+        let text = std::fs::read_to_string(&path).map_err(|source| Error::Read { path, source })?;
+        parse(root, &text).map_err(|problem| unusable(root, vec![problem]))
     }
 
     /// The scenes of a split, in the manifest's order.

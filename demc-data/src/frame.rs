@@ -166,6 +166,7 @@ impl FramePlanes {
         mask: Presence,
     ) -> Result<Self, Error> {
         let path = &file.path().to_owned();
+        let layout = &*layout.in_file(file, None)?;
         let wanted = FrameChannels::new(file, layout, reference, mask)?;
         let window = wanted.window(path, file)?;
         let names = wanted.names();
@@ -230,6 +231,7 @@ pub fn check_header(
     reference: Presence,
 ) -> Result<Window, Error> {
     let file = ExrFile::open(path)?;
+    let layout = &*layout.in_file(&file, None)?;
     FrameChannels::new(&file, layout, reference, Presence::IfPresent)?.window(path, &file)
 }
 

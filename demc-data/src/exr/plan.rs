@@ -114,7 +114,8 @@ impl RewritePlan {
         samples: usize,
         options: &WriteOptions,
     ) -> Result<Self, Error> {
-        let color = color_channels(file, layout, samples)?;
+        let layout = layout.in_file(file, None)?;
+        let color = color_channels(file, &layout, samples)?;
         let mut plan = Self {
             headers: Headers::new(),
             parts: Vec::new(),

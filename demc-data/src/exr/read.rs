@@ -117,7 +117,8 @@ impl<R: Read + Seek> ExrFile<R> {
     }
 
     /// Keeps decoded blocks of the parts with the layout's colour, up to `bytes` bytes.
-    /// [`rewrite`](super::rewrite::rewrite) then need not decompress them again.
+    /// [`rewrite`](super::rewrite::rewrite) then need not decompress them again. The layout has the
+    /// names of this file ([`ChannelLayout::in_file`]).
     pub fn keeping(mut self, layout: &ChannelLayout, bytes: usize) -> Self {
         let color = layout.color.iter().filter_map(|name| self.channel(name));
         self.source.kept = DecodedBlocks::new(color.map(|channel| channel.part).collect(), bytes);

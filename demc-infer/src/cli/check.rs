@@ -4,13 +4,15 @@ use std::path::PathBuf;
 
 use clap::Args;
 use demc_data::FrameSummary;
-use demc_data::frame::{FEATURE_NAMES, read_input};
+use demc_data::exr::ExrFile;
+use demc_data::frame::{FEATURE_NAMES, decode_input};
 use demc_data::ranges::Range;
 use demc_infer::Bundle;
 use serde::Serialize;
 
 use super::flags::{DeviceFlag, ModelFlag};
 use super::inputs::{Frames, Inputs};
+use super::layouts::{LayoutFlags, Layouts, say};
 use super::{Clamped, print};
 
 /// Compare images with a model's training data: statistics of each channel, and warnings.
@@ -23,6 +25,8 @@ use super::{Clamped, print};
 pub struct Arguments {
     #[command(flatten)]
     model: ModelFlag,
+    #[command(flatten)]
+    layout: LayoutFlags,
     /// Images: files, directories, glob patterns, or frame sequences
     #[arg(value_name = "IN.exr", required = true)]
     inputs: Vec<PathBuf>,
@@ -62,11 +66,12 @@ impl Arguments {
     /// Checks every image; an unreadable one ends the run.
     pub fn run(self) -> anyhow::Result<()> {
         let inputs = Inputs::expand(&self.inputs, self.frames)?;
+        let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
         let mut all = Vec::with_capacity(inputs.files.len());
         let mut clamped = Clamped::default();
         for path in inputs.files {
-            let (checked, negative) = FileCheck::new(path, &bundle)?;
+            let (checked, negative) = FileCheck::new(path, &bundle, &layouts)?;
             clamped.count(negative);
             if !self.json {
                 print(&checked.text())?;
@@ -87,8 +92,10 @@ impl Arguments {
 
 impl FileCheck {
     /// Checks one file. Also returns its number of negative samples.
-    fn new(file: PathBuf, bundle: &Bundle) -> anyhow::Result<(Self, usize)> {
-        let frame = read_input(&file, &bundle.meta.layout)?;
+    fn new(path: PathBuf, bundle: &Bundle, layouts: &Layouts) -> anyhow::Result<(Self, usize)> {
+        let mut file = ExrFile::open(&path)?;
+        let layout = layouts.of(&file, bundle, say)?;
+        let frame = decode_input(&mut file, &layout)?;
         let FrameSummary {
             exposure,
             mean,
@@ -113,7 +120,7 @@ impl FileCheck {
             warnings.push(format!("`denoise` refuses this image: {refused}"));
         }
         let checked = Self {
-            file,
+            file: path,
             exposure: row(exposure, ranges.map(|ranges| ranges.exposure)),
             channels: channels.collect(),
             warnings,

@@ -3,12 +3,14 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use demc_data::exr::ExrFile;
 use demc_data::frame::{Presence, check_header};
 use demc_infer::{Bundle, Ensemble, Tiling, memory};
 use demc_model::{DOWNSAMPLING, ModelConfig};
 use serde::Serialize;
 
 use super::flags::{DeviceFlag, ModelFlag, TilingFlags, describe};
+use super::layouts::{LayoutFlags, say};
 use super::print;
 
 /// Show the cost of denoising: parameters, operations, memory and tiles. Nothing is denoised.
@@ -20,6 +22,8 @@ use super::print;
 pub struct Arguments {
     #[command(flatten)]
     model: ModelFlag,
+    #[command(flatten)]
+    layout: LayoutFlags,
     /// Images; only their headers are read
     #[arg(value_name = "IN.exr", required_unless_present = "sizes")]
     inputs: Vec<PathBuf>,
@@ -82,11 +86,13 @@ struct ImageCost {
 
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
+        let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
         let tiling = self.tiling.tiling();
         let mut sizes = self.sizes;
         for input in &self.inputs {
-            let window = check_header(input, &bundle.meta.layout, Presence::Skip)?;
+            let layout = layouts.of(&ExrFile::open(input)?, &bundle, say)?;
+            let window = check_header(input, &layout, Presence::Skip)?;
             sizes.push((window.width, window.height));
         }
         let config = bundle.model.config();

@@ -17,6 +17,7 @@ use super::Clamped;
 use super::flags::{DeviceFlag, EnsembleFlag, ModelFlag, TilingFlags, describe};
 use super::inputs::{Frames, Inputs};
 use super::jobs::{Job, Jobs};
+use super::layouts::{LayoutFlags, Layouts};
 use super::progress::Progress;
 
 /// Largest cache of an input's decoded blocks in bytes, kept until its output is written (ours:
@@ -34,8 +35,8 @@ fn cache_bytes() -> usize {
 /// Inputs are files, directories, glob patterns, or frame sequences. Failed inputs are reported and
 /// skipped, and the exit code is 1. Rerun the command to resume a partly finished directory.
 ///
-/// The input's channels must have the names of the model's layout, which `demc-infer inspect`
-/// shows. An image that differs from the training data causes a warning with the likely cause.
+/// The channels of each input are found by their names: as in the model's training data, or as
+/// Mitsuba, pbrt, Blender Cycles or FBKSD write them. --layout chooses other names. An image that differs from the training data causes a warning with the likely cause.
 /// Negative radiance counts as 0.
 ///
 /// The output is the input with denoised colour. Parts, windows, attributes, compression and all
@@ -52,6 +53,8 @@ fn cache_bytes() -> usize {
 pub struct Arguments {
     #[command(flatten)]
     model: ModelFlag,
+    #[command(flatten)]
+    layout: LayoutFlags,
     /// Noisy images with feature channels: files, directories (their *.exr), glob patterns, or
     /// frame sequences (shot.####.exr or shot.%04d.exr)
     #[arg(value_name = "IN.exr", required = true)]
@@ -99,6 +102,7 @@ impl Arguments {
             let (done, all) = (jobs.skipped, jobs.skipped + jobs.list.len());
             eprintln!("note: {done} of {all} images already exist; --overwrite replaces them");
         }
+        let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
         if jobs.directory {
             fs::create_dir_all(&self.output)
@@ -110,7 +114,7 @@ impl Arguments {
         let mut failed = 0;
         for job in &jobs {
             progress.start(job.input.display());
-            match self.image(job, &bundle, &progress) {
+            match self.image(job, &bundle, &layouts, &progress) {
                 Ok(samples) => clamped.count(samples),
                 Err(error) if jobs.len() == 1 => return Err(error),
                 Err(error) => {
@@ -131,10 +135,18 @@ impl Arguments {
     }
 
     /// Denoises one image. Returns the number of negative samples, which were set to 0.
-    fn image(&self, job: &Job, bundle: &Bundle, progress: &Progress) -> anyhow::Result<usize> {
+    fn image(
+        &self,
+        job: &Job,
+        bundle: &Bundle,
+        layouts: &Layouts,
+        progress: &Progress,
+    ) -> anyhow::Result<usize> {
         let name = job.input.display();
-        let layout = &bundle.meta.layout;
-        let mut file = ExrFile::open(&job.input)?.keeping(layout, cache_bytes());
+        let file = ExrFile::open(&job.input)?;
+        let say = |choice: &str| progress.line(format_args!("note: {name}: {choice}"));
+        let layout = &layouts.of(&file, bundle, say)?;
+        let mut file = file.keeping(layout, cache_bytes());
         let frame = decode_input(&mut file, layout)?;
         for warning in bundle.warnings(&frame)? {
             progress.line(format_args!("warning: {name}: {warning}"));

@@ -13,6 +13,7 @@ mod import;
 mod inputs;
 mod inspect;
 mod jobs;
+mod layouts;
 mod progress;
 mod report;
 mod scenes;

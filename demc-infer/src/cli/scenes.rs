@@ -8,6 +8,7 @@ use demc_infer::report::SceneImages;
 use demc_infer::{Baseline, BaselineError, Ensemble, ImageScore, Report, Tiling, baseline};
 
 use super::flags::{DeviceFlag, EnsembleFlag, ModelFlag};
+use super::layouts::LayoutFlags;
 use super::progress::Progress;
 use super::{Clamped, UsageError};
 
@@ -16,6 +17,8 @@ use super::{Clamped, UsageError};
 pub struct Scenes {
     #[command(flatten)]
     model: ModelFlag,
+    #[command(flatten)]
+    layout: LayoutFlags,
     /// Data set: the directory with manifest.json
     #[arg(long, value_name = "DIR")]
     pub data: PathBuf,
@@ -67,8 +70,9 @@ impl Scenes {
         process: impl Fn(&SceneImages, usize) -> anyhow::Result<T> + Sync,
         mut finish: impl FnMut(T, &ImageScore) -> anyhow::Result<()>,
     ) -> anyhow::Result<Report> {
+        let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
-        let layout = &bundle.meta.layout;
+        let layout = &layouts.of_dataset(&self.data, &bundle)?;
         let dataset = Dataset::open(&self.data, layout)?;
         let scenes = dataset.split(self.split.into())?;
         baseline::check(&self.baselines, &scenes).map_err(|error| match error {

@@ -1,0 +1,132 @@
+//! `--layout` and `--layer`: which channels of a file hold the buffers.
+
+use std::cell::RefCell;
+use std::path::Path;
+
+use clap::Args;
+use demc_data::exr::ExrFile;
+use demc_data::layout::{FileLayout, Missing, detect};
+use demc_data::{ChannelLayout, Dataset, Error};
+use demc_infer::Bundle;
+
+use super::UsageError;
+
+/// `--layout`, `--layer`.
+#[derive(Args)]
+pub struct LayoutFlags {
+    /// Channel layout of the images: demc-exr, mitsuba3, pbrt-v4, cycles, fbksd, or a TOML file
+    /// [default: the model's own if it fits, otherwise the preset that fits]
+    #[arg(long, value_name = "PRESET|FILE")]
+    layout: Option<String>,
+    /// View layer of the images. Needed if there are several
+    #[arg(long, value_name = "NAME")]
+    layer: Option<String>,
+}
+
+/// Chooses the layout of each file.
+pub struct Layouts<'a> {
+    flags: &'a LayoutFlags,
+    /// The layout of `--layout`.
+    given: Option<ChannelLayout>,
+    /// The choices that were printed.
+    said: RefCell<Vec<String>>,
+}
+
+impl LayoutFlags {
+    /// Reads the layout of `--layout`.
+    ///
+    /// # Errors
+    /// Neither a preset nor a readable layout.
+    pub fn read(&self) -> Result<Layouts<'_>, UsageError> {
+        let given = self
+            .layout
+            .as_deref()
+            .map(ChannelLayout::resolve)
+            .transpose();
+        Ok(Layouts {
+            flags: self,
+            given: given.map_err(|error| UsageError(error.to_string()))?,
+            said: RefCell::default(),
+        })
+    }
+}
+
+impl Layouts<'_> {
+    /// The layout of `file`, with the names of its view layer. A choice among the presets is
+    /// passed to `say`, once for all files.
+    ///
+    /// # Errors
+    /// As [`detect`] and [`ChannelLayout::in_file`].
+    pub fn of(
+        &self,
+        file: &ExrFile,
+        bundle: &Bundle,
+        say: impl FnOnce(&str),
+    ) -> Result<ChannelLayout, Error> {
+        let layer = self.flags.layer.as_deref();
+        let missing = bundle.missing();
+        if let Some(given) = &self.given {
+            let mut layout = given.in_file(file, layer)?.into_owned();
+            let policies = &mut layout.missing;
+            for (own, model) in [
+                (&mut policies.normal, missing.normal),
+                (&mut policies.position, missing.position),
+                (&mut policies.texture1, missing.texture1),
+                (&mut policies.texture2, missing.texture2),
+            ] {
+                if *own == Missing::Error {
+                    *own = model;
+                }
+            }
+            return Ok(layout);
+        }
+        let own = &bundle.meta.layout;
+        if let Ok(own) = own.in_file(file, layer)
+            && own.fits(file)
+        {
+            return Ok(own.into_owned());
+        }
+        let found = detect(file, missing, layer)?;
+        let choice = describe(&found);
+        if !self.said.borrow().contains(&choice) {
+            say(&choice);
+            self.said.borrow_mut().push(choice);
+        }
+        Ok(found.layout)
+    }
+
+    /// The layout of a data set: that of its first file.
+    ///
+    /// # Errors
+    /// As [`Dataset::list`] and [`of`](Self::of).
+    pub fn of_dataset(&self, root: &Path, bundle: &Bundle) -> anyhow::Result<ChannelLayout> {
+        let scenes = Dataset::list(root)?;
+        let first = scenes.first().map(|scene| ExrFile::open(&scene.path));
+        Ok(match (&self.given, first) {
+            (None, Some(Ok(file))) => self.of(&file, bundle, say)?,
+            // Opening the data set names what is wrong with its files.
+            (given, _) => given.as_ref().unwrap_or(&bundle.meta.layout).clone(),
+        })
+    }
+}
+
+/// Prints a choice on stderr.
+pub fn say(choice: &str) {
+    eprintln!("note: {choice}");
+}
+
+fn describe(found: &FileLayout) -> String {
+    let mut text = format!("layout {}", found.preset);
+    if let Some(layer) = &found.layer {
+        text += &format!(", view layer {layer:?}");
+    }
+    let policies = found.layout.features();
+    let absent = policies.iter().filter(|(_, names, _)| names.is_none());
+    for (buffer, _, policy) in absent {
+        text += &match policy {
+            Missing::CopyTexture1 => format!("; no {buffer}: texture1 replaces it"),
+            _ => format!("; no {buffer}: zeros replace it"),
+        };
+    }
+    text
+}
