@@ -70,7 +70,11 @@ fn tiles(bundle: &Bundle, frame: &Frame) -> anyhow::Result<()> {
         tiling(whole / 2, exact),
     ];
     let run = |tiling: &Tiling| {
-        let denoised = bundle.denoise_tiled(frame, tiling, Ensemble::One, |_, _| ());
+        let options = DenoiseOptions {
+            tiling: tiling.clone(),
+            ..DenoiseOptions::default()
+        };
+        let denoised = bundle.denoise_with(frame, &options, |_, _| ());
         std::hint::black_box(denoised.expect("it fits"));
     };
     let turns = interleaved(

@@ -89,8 +89,7 @@ fn open(config: &DataConfig) -> anyhow::Result<PatchSource> {
     let statistics = Statistics::measure(
         &scenes,
         &layout,
-        config.gamma,
-        None,
+        config,
         LossConfig::default().relmse_epsilon,
     )?;
     Ok(PatchSource::new(

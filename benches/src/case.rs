@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, ensure};
 use burn::tensor::Device;
-use demc_data::{Batch, ChannelLayout, FEATURES, FeatureStats, Normalizer};
+use demc_data::{Batch, ChannelLayout, FEATURES, FeatureStats, Normalizer, PositionSpace};
 use demc_infer::{Bundle, BundleMeta, Names, Precision};
 use demc_model::{ModelConfig, Reading, Role, Variant, WeightSpec, Weights};
 use rand::{RngExt, SeedableRng};
@@ -54,6 +54,7 @@ pub fn network(width: usize) -> Bundle {
     let normalizer = Normalizer {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
+        position: PositionSpace::Scene,
         features: FeatureStats {
             mean: [0.0; FEATURES],
             std: [1.0; FEATURES],

@@ -83,7 +83,12 @@ impl PatchSource {
         assert!(!scenes.is_empty(), "training needs at least one scene");
         let patches = patches(&scenes, config.patch_size, config.stride, config.border)?;
         Ok(Self {
-            cache: SceneCache::new(scenes, layout, config.cache_mib.saturating_mul(1 << 20)),
+            cache: SceneCache::new(
+                scenes,
+                layout,
+                config.position,
+                config.cache_mib.saturating_mul(1 << 20),
+            ),
             epoch_orders: EpochOrders::new(patches.len(), seed),
             patches,
             normalizer,

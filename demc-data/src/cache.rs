@@ -8,12 +8,15 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::dataset::size_mismatch;
 use crate::frame::{FramePlanes, Presence};
+use crate::position::PositionSpace;
 use crate::{ChannelLayout, Error, Scene};
 
-/// The scenes of a training run, decoded on demand: colour, features and reference, no mask.
+/// The scenes of a training run, decoded on demand: colour, features and reference, no mask. The
+/// positions are in the run's [`PositionSpace`].
 pub struct SceneCache {
     scenes: Vec<Scene>,
     layout: ChannelLayout,
+    position: PositionSpace,
     budget: usize,
     turns: Vec<Mutex<()>>,
     kept: Mutex<CachedScenes>,
@@ -45,11 +48,17 @@ struct CachedScene {
 
 impl SceneCache {
     /// An empty cache over `scenes` that holds at most `budget` bytes.
-    pub fn new(scenes: Vec<Scene>, layout: ChannelLayout, budget: usize) -> Self {
+    pub fn new(
+        scenes: Vec<Scene>,
+        layout: ChannelLayout,
+        position: PositionSpace,
+        budget: usize,
+    ) -> Self {
         let turns = scenes.iter().map(|_| Mutex::default()).collect();
         Self {
             scenes,
             layout,
+            position,
             budget,
             turns,
             kept: Mutex::default(),
@@ -76,7 +85,7 @@ impl SceneCache {
             return Ok(planes);
         }
         let scene = &self.scenes[index];
-        let planes = FramePlanes::read(
+        let mut planes = FramePlanes::read(
             &scene.path,
             &self.layout,
             Presence::Required,
@@ -85,6 +94,7 @@ impl SceneCache {
         if let Some(error) = size_mismatch(scene, planes.width, planes.height) {
             return Err(error);
         }
+        planes.map_positions(self.position);
         let planes = Arc::new(planes);
         lock(&self.kept).keep(index, &planes, self.budget);
         Ok(planes)

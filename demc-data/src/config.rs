@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::augment::Augment;
 use crate::patch::Border;
+use crate::position::PositionSpace;
 
 /// The committed sample data, so that every configuration runs without an edit.
 const ROOT: &str = "data/sample";
@@ -64,6 +65,9 @@ pub struct DataConfig {
     /// by it ([`crate::Normalizer::modulation`]). From 0.001 to 1; absent: off, as in the paper.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub albedo_demodulation_epsilon: Option<f32>,
+    /// `"scene"`: positions as rendered, as in the paper; `"image"`: relative to the image
+    /// ([`crate::PositionMap`]).
+    pub position: PositionSpace,
     /// Patches in a batch, at most 65536.
     pub batch_size: usize,
     /// Share of the training split's base scenes held out for validation, from 0 to below 1.
@@ -88,6 +92,7 @@ impl Default for DataConfig {
             border: BORDER,
             gamma: GAMMA,
             albedo_demodulation_epsilon: None,
+            position: PositionSpace::Scene,
             batch_size: BATCH_SIZE,
             validation: VALIDATION,
             augment: Augment::default(),

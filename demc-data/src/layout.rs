@@ -103,6 +103,21 @@ impl MissingPolicies {
     pub fn in_order(self) -> [Missing; 4] {
         [self.normal, self.position, self.texture1, self.texture2]
     }
+
+    /// These policies, and those of `other` for buffers whose absence is an error here.
+    #[must_use]
+    pub fn or(self, other: Self) -> Self {
+        let or = |own, other| match own {
+            Missing::Error => other,
+            own => own,
+        };
+        Self {
+            normal: or(self.normal, other.normal),
+            position: or(self.position, other.position),
+            texture1: or(self.texture1, other.texture1),
+            texture2: or(self.texture2, other.texture2),
+        }
+    }
 }
 
 /// The replacement for a missing buffer.

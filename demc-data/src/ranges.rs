@@ -13,10 +13,24 @@ const EXPOSURE_GAMMA: f64 = 2.2;
 /// Share of the training scenes below and above a range (ours).
 const TAIL: f64 = 0.05;
 
+/// The exposure of planar colour `[3, N]`, linear HDR: `mean(luminance^(1/2.2))^2.2`, 0 if it is
+/// black. A firefly hardly changes it.
+pub fn exposure(color_hdr: &[f32]) -> f64 {
+    let pixels = color_hdr.len() / 3;
+    let compressed: f64 = (0..pixels)
+        .map(|i| {
+            let channels = LUMINANCE.iter().enumerate();
+            let luminance: f32 = channels.map(|(c, y)| y * color_hdr[c * pixels + i]).sum();
+            f64::from(luminance.max(0.0)).powf(1.0 / EXPOSURE_GAMMA)
+        })
+        .sum();
+    (compressed / pixels.max(1) as f64).powf(EXPOSURE_GAMMA)
+}
+
 /// Summary values of one image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrameSummary {
-    /// `mean(luminance^(1/2.2))^2.2` of the noisy colour, linear HDR.
+    /// [`exposure`] of the noisy colour.
     pub exposure: f64,
     /// Mean of each feature channel; for normals and positions over pixels with a hit.
     pub mean: [f64; FEATURES],
@@ -38,16 +52,8 @@ impl FrameSummary {
 
     /// From the noisy colour, planar `[3, N]`, and the moments of the features.
     pub(crate) fn new(color_hdr: &[f32], features: &[ChannelMoments; FEATURES]) -> Self {
-        let pixels = color_hdr.len() / 3;
-        let compressed: f64 = (0..pixels)
-            .map(|i| {
-                let channels = LUMINANCE.iter().enumerate();
-                let luminance: f32 = channels.map(|(c, y)| y * color_hdr[c * pixels + i]).sum();
-                f64::from(luminance.max(0.0)).powf(1.0 / EXPOSURE_GAMMA)
-            })
-            .sum();
         Self {
-            exposure: (compressed / pixels.max(1) as f64).powf(EXPOSURE_GAMMA),
+            exposure: exposure(color_hdr),
             mean: features.map(|moments| moments.mean),
             std: features.map(|moments| moments.std()),
         }

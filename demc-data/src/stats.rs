@@ -9,7 +9,7 @@ use crate::parallel;
 use crate::plane::Plane;
 use crate::ranges::{FrameSummary, Ranges};
 use crate::transform::STD_FLOOR;
-use crate::{ChannelLayout, Error, FeatureStats, Normalizer, Scene};
+use crate::{ChannelLayout, DataConfig, Error, FeatureStats, Normalizer, Scene};
 
 /// Maximum number of scenes decoded at the same time: eight of 1280x720 take about 300 MB.
 const MAX_THREADS: usize = 8;
@@ -30,8 +30,8 @@ pub struct Statistics {
 }
 
 impl Statistics {
-    /// Measures `scenes`. `gamma` and `albedo_demodulation_epsilon` are those of [`Normalizer`];
-    /// `relmse_epsilon` is the epsilon of Eq. 5 that the flat colour is fitted with.
+    /// Measures `scenes` for the input conversion of `config`. `relmse_epsilon` is the epsilon of
+    /// Eq. 5 that the flat colour is fitted with.
     ///
     /// # Errors
     /// The error of the first unusable scene, as in [`crate::read_frame`]. Reference and mask must
@@ -39,13 +39,11 @@ impl Statistics {
     pub fn measure(
         scenes: &[Scene],
         layout: &ChannelLayout,
-        gamma: f32,
-        albedo_demodulation_epsilon: Option<f32>,
+        config: &DataConfig,
         relmse_epsilon: f32,
     ) -> Result<Self, Error> {
         let threads = parallel::available().min(MAX_THREADS);
-        let epsilon = albedo_demodulation_epsilon;
-        Self::measure_on(threads, scenes, layout, gamma, epsilon, relmse_epsilon)
+        Self::measure_on(threads, scenes, layout, config, relmse_epsilon)
     }
 
     /// As [`Self::measure`], on a given number of threads.
@@ -56,13 +54,17 @@ impl Statistics {
         threads: usize,
         scenes: &[Scene],
         layout: &ChannelLayout,
-        gamma: f32,
-        albedo_demodulation_epsilon: Option<f32>,
+        config: &DataConfig,
         relmse_epsilon: f32,
     ) -> Result<Self, Error> {
+        let DataConfig {
+            gamma,
+            albedo_demodulation_epsilon,
+            position,
+            ..
+        } = *config;
         let relmse_epsilon = decimal(relmse_epsilon);
-        let scene_sums =
-            |scene| SceneSums::of(scene, layout, albedo_demodulation_epsilon, relmse_epsilon);
+        let scene_sums = |scene| SceneSums::of(scene, layout, config, relmse_epsilon);
         let mut total = SceneSums::default();
         let mut summaries = Vec::with_capacity(scenes.len());
         for sums in parallel::map(threads, scenes.iter().collect(), scene_sums) {
@@ -74,6 +76,7 @@ impl Statistics {
             normalizer: Normalizer {
                 gamma,
                 albedo_demodulation_epsilon,
+                position,
                 features: FeatureStats {
                     mean: total.features.map(|moments| moments.mean as f32),
                     std: total
@@ -107,14 +110,16 @@ impl SceneSums {
     fn of(
         scene: &Scene,
         layout: &ChannelLayout,
-        albedo_epsilon: Option<f32>,
+        config: &DataConfig,
         relmse_epsilon: f64,
     ) -> Result<Self, Error> {
-        let planes =
+        let mut planes =
             FramePlanes::read(&scene.path, layout, Presence::Required, Presence::Required)?;
         if let Some(error) = size_mismatch(scene, planes.width, planes.height) {
             return Err(error);
         }
+        planes.map_positions(config.position);
+        let albedo_epsilon = config.albedo_demodulation_epsilon;
         let pixels = planes.width * planes.height;
         let mask = planes.mask.as_ref().map(Plane::to_f32);
         let misses = mask.iter().flatten().filter(|share| **share <= 0.0);

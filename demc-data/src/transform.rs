@@ -5,6 +5,11 @@
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::frame::{FEATURES, TEXTURES};
+use crate::position::{PositionMap, PositionSpace};
+
+/// Largest albedo: larger values count as this. Where a lamp is seen in metal, a renderer may write
+/// 90, which demodulation would turn into a spike.
+pub const MAX_ALBEDO: f32 = 1.0;
 
 /// Minimum standard deviation of a feature channel, in the channel's own unit (ours: the paper is
 /// silent). It makes a constant channel zero instead of 0/0. 1e-3 is half precision's spacing at 1,
@@ -36,6 +41,9 @@ pub struct Normalizer {
         skip_serializing_if = "Option::is_none"
     )]
     pub albedo_demodulation_epsilon: Option<f32>,
+    /// What the origin and the unit of positions are.
+    #[serde(default, skip_serializing_if = "PositionSpace::is_scene")]
+    pub position: PositionSpace,
     /// Mean and standard deviation for the Z-score.
     pub features: FeatureStats,
     /// The flat output with the least RelMSE (Eq. 5) against the training references, in gamma
@@ -48,8 +56,20 @@ fn none_if_zero<'de, D: Deserializer<'de>>(number: D) -> Result<Option<f32>, D::
 }
 
 impl Normalizer {
+    /// The mapping of an image's positions, which comes before the Z-score; `None` for
+    /// [`PositionSpace::Scene`].
+    ///
+    /// # Shapes
+    /// `features`, as rendered, is `[12, N]`: the whole image.
+    pub fn position_map(&self, features: &[f32]) -> Option<PositionMap> {
+        match self.position {
+            PositionSpace::Scene => None,
+            PositionSpace::Image => Some(PositionMap::of(features)),
+        }
+    }
+
     /// The divisor of the network's input colour and the factor on its output, in gamma space:
-    /// `(max(albedo, 0) + epsilon)^(1/gamma)`, with the albedo of the first hit (albedo
+    /// `(clamp(albedo, 0, 1) + epsilon)^(1/gamma)`, with the albedo of the first hit (albedo
     /// demodulation: Bako et al. 2017 for diffuse light; ours here). `None` without an epsilon.
     ///
     /// # Shapes
@@ -67,7 +87,7 @@ impl Normalizer {
         let size = features.len() / FEATURES;
         let mut texture = features[TEXTURES * size..(TEXTURES + 3) * size].to_vec();
         for value in &mut texture {
-            *value = value.max(0.0) + epsilon;
+            *value = value.clamp(0.0, MAX_ALBEDO) + epsilon;
         }
         gamma_from_hdr(&mut texture, self.gamma);
         Some(texture)
@@ -93,7 +113,8 @@ impl Normalizer {
         }
     }
 
-    /// Converts features to Z-scores in place: `(x - mean) / std`.
+    /// Converts features to Z-scores in place: `(x - mean) / std`. Albedo above [`MAX_ALBEDO`]
+    /// counts as that.
     ///
     /// # Shapes
     /// `planes` is `[12, N]`.
@@ -101,6 +122,10 @@ impl Normalizer {
     /// # Panics
     /// If the length is not a multiple of 12.
     pub fn features_z_from_raw(&self, planes: &mut [f32]) {
+        let pixels = planes.len() / FEATURES;
+        for value in &mut planes[TEXTURES * pixels..] {
+            *value = value.min(MAX_ALBEDO);
+        }
         self.for_each_feature(planes, |value, mean, std| (value - mean) / std);
     }
 
@@ -152,6 +177,7 @@ mod tests {
         Normalizer {
             gamma: 2.2,
             albedo_demodulation_epsilon: None,
+            position: PositionSpace::Scene,
             features,
             flat_color: [0.4; 3],
         }
@@ -212,9 +238,7 @@ mod tests {
 
     #[test]
     fn z_scores_come_back_to_the_features() {
-        let raw: Vec<f32> = (0..FEATURES * 5)
-            .map(|i| (i as f32 * 0.37).sin() * 3.0)
-            .collect();
+        let raw: Vec<f32> = (0..FEATURES * 5).map(|i| (i as f32 * 0.37).sin()).collect();
         let mut planes = raw.clone();
         normalizer().features_z_from_raw(&mut planes);
         assert_ne!(planes, raw);
@@ -226,12 +250,31 @@ mod tests {
 
     #[test]
     fn each_channel_has_its_own_mean_and_deviation() {
-        // The last channel has mean 5.5 and std 3, so 8.5 is one deviation above the mean.
+        // Channel 5 has mean -0.5 and std 1.5, so 1 is one deviation above the mean.
         let mut planes = vec![0.0; FEATURES * 2];
-        planes[22..].copy_from_slice(&[8.5, 5.5]);
+        planes[10..12].copy_from_slice(&[1.0, -0.5]);
         normalizer().features_z_from_raw(&mut planes);
-        assert_eq!(planes[22..], [1.0, 0.0]);
+        assert_eq!(planes[10..12], [1.0, 0.0]);
         assert_eq!(planes[0], 5.5 / 0.25);
+    }
+
+    #[test]
+    fn albedo_above_one_counts_as_one() {
+        let normalizer = Normalizer {
+            albedo_demodulation_epsilon: Some(0.07),
+            ..normalizer()
+        };
+        let mut planes = vec![0.5; FEATURES];
+        let mut bright = planes.clone();
+        (planes[7], bright[7]) = (1.0, 91.0);
+        assert_eq!(
+            normalizer.modulation(&bright),
+            normalizer.modulation(&planes)
+        );
+        for planes in [&mut planes, &mut bright] {
+            normalizer.features_z_from_raw(planes);
+        }
+        assert_eq!(bright, planes);
     }
 
     #[test]

@@ -7,7 +7,7 @@ use std::fs;
 use std::path::Path;
 
 use demc_data::transform::STD_FLOOR;
-use demc_data::{ChannelLayout, Dataset, Error, Scene, Split, Statistics, read_frame};
+use demc_data::{ChannelLayout, DataConfig, Dataset, Error, Scene, Split, Statistics, read_frame};
 use serde_json::{Value, json};
 use support::{half, layout, sample, scene_channels, write};
 
@@ -180,7 +180,8 @@ fn a_data_set_without_masks_is_measured_over_every_pixel() {
     }
     write(&dir.path().join("a.exr"), (8, 6), channels.clone());
     let set = Dataset::open(dir.path(), &layout).expect("all that training needs");
-    let stats = Statistics::measure(&set.scenes, &layout, 2.2, None, 0.001).expect("sound");
+    let stats =
+        Statistics::measure(&set.scenes, &layout, &DataConfig::default(), 0.001).expect("sound");
     assert_eq!((stats.pixels, stats.misses), (48, 0));
     // Position is channel 6 of the file, stored as float: 6 + i / 48 at pixel i.
     let mean = stats.normalizer.features.mean;
@@ -235,7 +236,7 @@ fn statistics_are_the_same_on_any_number_of_threads() {
         .and_then(|set| set.split(Split::Train))
         .expect("the sample");
     let measure = |threads| {
-        Statistics::measure_on(threads, &scenes, &layout(), 2.2, None, 0.001)
+        Statistics::measure_on(threads, &scenes, &layout(), &DataConfig::default(), 0.001)
             .expect("the sample is sound")
     };
     let one = measure(1);
@@ -250,8 +251,8 @@ fn statistics_normalise_the_scenes_they_were_measured_on() {
     let scenes = Dataset::open(&sample(), &layout())
         .and_then(|set| set.split(Split::Train))
         .expect("the sample");
-    let stats =
-        Statistics::measure(&scenes, &layout(), 2.2, None, 0.001).expect("the sample is sound");
+    let stats = Statistics::measure(&scenes, &layout(), &DataConfig::default(), 0.001)
+        .expect("the sample is sound");
     let mut sums = [[0.0f64; 2]; 12];
     let mut count = 0.0;
     for scene in &scenes {
@@ -321,7 +322,8 @@ fn misses_count_for_textures_and_not_for_geometry_and_constants_keep_a_floor() {
         }
     }
     write(&dir.path().join("a.exr"), (8, 6), channels);
-    let stats = Statistics::measure(&set.scenes, &layout(), 2.2, None, 0.001).expect("sound");
+    let stats =
+        Statistics::measure(&set.scenes, &layout(), &DataConfig::default(), 0.001).expect("sound");
     assert_eq!((stats.pixels, stats.misses, stats.clamped), (48, 24, 24));
     let features = stats.normalizer.features;
     assert_eq!((features.mean[0], features.std[0]), (2.0, STD_FLOOR));

@@ -3,7 +3,7 @@
 mod common;
 
 use common::{demc_infer, random_bundle, sample};
-use demc_data::{Dataset, Frame, Split, Statistics, read_frame};
+use demc_data::{DataConfig, Dataset, Frame, Split, Statistics, read_frame};
 use demc_infer::{Bundle, Names, Precision};
 
 fn trained() -> (Bundle, Vec<(Split, Frame)>) {
@@ -11,7 +11,8 @@ fn trained() -> (Bundle, Vec<(Split, Frame)>) {
     let layout = bundle.meta.layout.clone();
     let dataset = Dataset::open(&sample(), &layout).expect("the sample");
     let training = dataset.split(Split::Train).expect("training scenes");
-    let statistics = Statistics::measure(&training, &layout, 2.2, None, 1e-3).expect("sound");
+    let statistics =
+        Statistics::measure(&training, &layout, &DataConfig::default(), 1e-3).expect("sound");
     bundle.meta.normalizer = statistics.normalizer;
     bundle.meta.ranges = Some(statistics.ranges);
     let frames = dataset.scenes.iter().map(|scene| {
@@ -104,7 +105,7 @@ fn check_prints_the_table_and_fails_on_a_warning() {
     // A range that no image is in.
     let mut strict = bundle;
     let ranges = strict.meta.ranges.as_mut().expect("they were set");
-    ranges.exposure = demc_data::ranges::Range {
+    ranges.mean[6] = demc_data::ranges::Range {
         low: 1e6,
         high: 2e6,
     };
@@ -117,7 +118,7 @@ fn check_prints_the_table_and_fails_on_a_warning() {
     let json: serde_json::Value = serde_json::from_str(&outcome.stdout).expect("JSON");
     for image in json.as_array().expect("a list") {
         let warning = image["warnings"][0].as_str().expect("a warning");
-        assert!(warning.starts_with("colour: it is "), "{warning}");
+        assert!(warning.starts_with("texture1.r: its mean is "), "{warning}");
     }
     assert!(
         outcome

@@ -53,13 +53,7 @@ pub fn run(root: &Path, layout_name: &str, split: Split, json: bool) -> Result<(
     let dataset = Dataset::open(root, &layout)?;
     let config = DataConfig::default();
     let scenes = dataset.split(split)?;
-    let measured = Statistics::measure(
-        &scenes,
-        &layout,
-        config.gamma,
-        config.albedo_demodulation_epsilon,
-        RELMSE_EPSILON,
-    )?;
+    let measured = Statistics::measure(&scenes, &layout, &config, RELMSE_EPSILON)?;
     let splits = [Split::Train, Split::Test].into_iter().filter_map(|split| {
         let scenes = dataset.split(split).ok()?;
         Some((split, contents(&scenes, &config)))

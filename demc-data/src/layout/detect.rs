@@ -120,7 +120,8 @@ impl ChannelLayout {
     }
 }
 
-/// The preset that fits a file. `missing` says which feature buffers the file may lack.
+/// The preset that fits a file. The file may lack the feature buffers that have a policy in
+/// `missing` or in the preset.
 ///
 /// # Errors
 /// [`Error::Layout`]: no preset fits (it names the nearest one and what that lacks), several fit
@@ -135,6 +136,7 @@ pub fn detect<R: Read + Seek>(
     let mut nearest: (usize, &str, Vec<String>) = (0, "", Vec::new());
     for (preset, text) in PRESETS {
         let pattern = ChannelLayout::from_toml(preset, text).expect("presets are valid");
+        let missing = missing.or(pattern.missing);
         let found = pattern.layers(file);
         let layers = match (pattern.has_any_layer(), layer) {
             (true, Some(layer)) => {

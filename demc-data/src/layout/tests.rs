@@ -1,6 +1,7 @@
 //! Tests of layouts.
 
 use super::*;
+use crate::exr::ExrFile;
 
 const MINIMAL: &str = r#"
     color = ["R", "G", "B"]
@@ -86,8 +87,153 @@ fn all_problems_are_named_at_once() {
 fn unknown_keys_are_refused_with_their_line() {
     let error = message(&format!("{MINIMAL}albedo3 = [\"a\", \"b\", \"c\"]"));
     assert!(
-        error.contains("line 6") && error.contains("albedo3"),
+        error.contains("line 5") && error.contains("albedo3"),
         "{error}"
     );
     assert!(!error.contains('\n'), "{error}");
+}
+
+/// An EXR file with these channels, 2x2 pixels, in one part per entry.
+fn file(directory: &Path, parts: &[(&str, &[&str])]) -> ExrFile {
+    use exr::prelude::*;
+    let path = directory.join("file.exr");
+    let layers = parts.iter().map(|(part, names)| {
+        let channels = names
+            .iter()
+            .map(|name| AnyChannel::new(*name, FlatSamples::F32(vec![0.5; 4])));
+        let mut attributes = LayerAttributes::named(*part);
+        if part.is_empty() {
+            attributes.layer_name = None;
+        }
+        Layer::new(
+            (2, 2),
+            attributes,
+            Encoding::FAST_LOSSLESS,
+            AnyChannels::sort(channels.collect()),
+        )
+    });
+    let layers: Vec<_> = layers.collect();
+    let window = IntegerBounds::from_dimensions((2, 2));
+    let image = Image::from_layers(ImageAttributes::new(window), layers);
+    image.write().to_file(&path).expect("written");
+    ExrFile::open(&path).expect("an EXR file")
+}
+
+const RGB: [&str; 3] = ["R", "G", "B"];
+
+/// The channels of `layout`'s buffers except `without`, with a view layer in place of `*`.
+fn names(preset: &str, without: &[&str], layers: &[&str]) -> Vec<String> {
+    let layout = ChannelLayout::resolve(preset).expect("a preset");
+    let features = layout.features().into_iter();
+    let features = features.filter(|(buffer, ..)| !without.contains(buffer));
+    let features = features.filter_map(|(_, names, _)| names.cloned());
+    let names: Vec<String> = features.chain([layout.color.clone()]).flatten().collect();
+    let layers = layers.iter();
+    layers
+        .flat_map(|layer| names.iter().map(move |name| name.replacen('*', layer, 1)))
+        .collect()
+}
+
+fn detected(channels: &[String], layer: Option<&str>) -> Result<FileLayout, String> {
+    let directory = tempfile::tempdir().expect("a directory");
+    let channels: Vec<&str> = channels.iter().map(String::as_str).collect();
+    let file = file(directory.path(), &[("", &channels)]);
+    let missing = MissingPolicies {
+        position: Missing::Zeros,
+        texture2: Missing::CopyTexture1,
+        ..MissingPolicies::default()
+    };
+    let found = detect(&file, missing, layer);
+    found.map_err(|error| {
+        let error = error.to_string();
+        assert!(!error.contains('\n'), "{error}");
+        error
+    })
+}
+
+#[test]
+fn each_preset_is_found_by_its_channels() {
+    for (preset, _) in PRESETS {
+        let found = detected(&names(preset, &[], &["View Layer.1"]), None).expect(preset);
+        assert_eq!(found.preset, preset);
+        let layer = (preset == "cycles").then_some("View Layer.1");
+        assert_eq!(found.layer.as_deref(), layer, "{preset}");
+    }
+}
+
+#[test]
+fn position_and_second_texture_may_be_absent_but_not_in_part() {
+    let without = ["position", "texture2"];
+    let mut channels = names("demc-exr", &without, &[""]);
+    let found = detected(&channels, None).expect("color, normal, texture1");
+    assert_eq!(
+        (found.preset, found.absent()),
+        ("demc-exr", without.to_vec())
+    );
+    channels.push("position.X".into());
+    let error = detected(&channels, None).expect_err("one of three");
+    assert!(
+        error.ends_with("the nearest, demc-exr, lacks position.Y, position.Z"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_refusal_names_the_nearest_preset_and_what_it_lacks() {
+    let channels = names("cycles", &["texture1"], &["ViewLayer"]);
+    let error = detected(&channels, None).expect_err("no albedo");
+    assert!(
+        error.ends_with(
+            "no preset fits; the nearest, cycles, lacks ViewLayer.Denoising Albedo.R, \
+             ViewLayer.Denoising Albedo.G, ViewLayer.Denoising Albedo.B"
+        ),
+        "{error}"
+    );
+    let channels = ["ch00", "ch01"].map(String::from);
+    let error = detected(&channels, None).expect_err("no name is known");
+    assert!(
+        error.ends_with("no preset has any of its channels: ch00, ch01"),
+        "{error}"
+    );
+}
+
+#[test]
+fn two_presets_that_fit_equally_well_are_refused() {
+    let mut channels = names("demc-exr", &[], &[""]);
+    channels.extend(names("fbksd", &[], &[""]));
+    let error = detected(&channels, None).expect_err("two fit");
+    assert!(
+        error.ends_with("several presets fit equally well: demc-exr, fbksd; choose one"),
+        "{error}"
+    );
+}
+
+#[test]
+fn one_of_several_view_layers_is_chosen_by_name() {
+    let channels = names("cycles", &[], &["Near", "Far"]);
+    let error = detected(&channels, None).expect_err("two layers");
+    assert!(error.contains("cycles with view layer \"Near\""), "{error}");
+    let found = detected(&channels, Some("Near")).expect("one of them");
+    assert_eq!(found.layout.color[0], "Near.Combined.R");
+    let error = detected(&channels, Some("Sky")).expect_err("neither");
+    assert!(
+        error.contains("no view layer \"Sky\"; there is") && error.contains("Near"),
+        "{error}"
+    );
+}
+
+#[test]
+fn one_part_per_pass_is_read_like_one_part() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let xyz = ["X", "Y", "Z"];
+    let parts: [(&str, &[&str]); 4] = [
+        ("ViewLayer.Combined", &RGB),
+        ("ViewLayer.Normal", &xyz),
+        ("ViewLayer.Position", &xyz),
+        ("ViewLayer.Denoising Albedo", &RGB),
+    ];
+    let file = file(directory.path(), &parts);
+    let found = detect(&file, MissingPolicies::default(), None).expect("cycles");
+    assert_eq!(found.layer.as_deref(), Some("ViewLayer"));
+    assert_eq!(found.layout.missing.texture2, Missing::CopyTexture1);
 }

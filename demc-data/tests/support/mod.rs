@@ -8,7 +8,7 @@ pub mod rewritten;
 use std::path::{Path, PathBuf};
 
 use demc_data::transform::FeatureStats;
-use demc_data::{ChannelLayout, Normalizer};
+use demc_data::{ChannelLayout, Normalizer, PositionSpace};
 use exr::prelude::*;
 
 /// The committed sample set.
@@ -30,6 +30,7 @@ pub fn identity() -> Normalizer {
     Normalizer {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
+        position: PositionSpace::Scene,
         features,
         flat_color: [0.4; 3],
     }

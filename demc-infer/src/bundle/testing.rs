@@ -1,7 +1,7 @@
 //! A tiny network with random weights and a frame with a pattern, for this crate's tests.
 
 use burn::tensor::Device;
-use demc_data::{ChannelLayout, FEATURES, FeatureStats, Frame, Normalizer};
+use demc_data::{ChannelLayout, FEATURES, FeatureStats, Frame, Normalizer, PositionSpace};
 use demc_model::{ModelConfig, Reading, Variant};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -23,6 +23,7 @@ pub(crate) fn bundle(variant: Variant) -> Bundle {
     let normalizer = Normalizer {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
+        position: PositionSpace::Scene,
         features,
         flat_color: [0.4, 0.3, 0.2],
     };

@@ -9,11 +9,12 @@ use demc_data::ChannelLayout;
 use demc_data::exr::rewrite::{OutputChannels, WriteOptions, rewrite};
 use demc_data::exr::{Compression, ExrFile};
 use demc_data::frame::decode_input;
-use demc_infer::denoise::SeamError;
+use demc_infer::denoise::{DenoiseOptions, SeamError};
 use demc_infer::guard::EnergyBias;
 use demc_infer::{Bundle, Picture, memory};
 
 use super::Clamped;
+use super::exposure::{InputScaleFlag, SequenceScales};
 use super::flags::{DeviceFlag, EnsembleFlag, ModelFlag, TilingFlags, describe};
 use super::inputs::{Frames, Inputs};
 use super::jobs::{Job, Jobs};
@@ -36,8 +37,9 @@ fn cache_bytes() -> usize {
 /// skipped, and the exit code is 1. Rerun the command to resume a partly finished directory.
 ///
 /// The channels of each input are found by their names: as in the model's training data, or as
-/// Mitsuba, pbrt, Blender Cycles or FBKSD write them. --layout chooses other names. An image that differs from the training data causes a warning with the likely cause.
-/// Negative radiance counts as 0.
+/// Mitsuba, pbrt, Blender Cycles or FBKSD write them. --layout chooses other names. An image that
+/// differs from the training data causes a warning with the likely cause. Negative radiance counts
+/// as 0.
 ///
 /// The output is the input with denoised colour. Parts, windows, attributes, compression and all
 /// other channels stay.
@@ -84,6 +86,8 @@ pub struct Arguments {
     )]
     exposure: f32,
     #[command(flatten)]
+    input_scale: InputScaleFlag,
+    #[command(flatten)]
     ensemble: EnsembleFlag,
     #[command(flatten)]
     tiling: TilingFlags,
@@ -110,11 +114,16 @@ impl Arguments {
         }
         let jobs = jobs.list;
         let progress = Progress::new(jobs.len());
+        let mut scales = SequenceScales::new(&inputs.sequences);
         let mut clamped = Clamped::default();
         let mut failed = 0;
         for job in &jobs {
             progress.start(job.input.display());
-            match self.image(job, &bundle, &layouts, &progress) {
+            let scale = match self.input_scale.choice.factor() {
+                None => scales.of(&job.input, &bundle, &layouts),
+                given => given,
+            };
+            match self.image(job, scale, &bundle, &layouts, &progress) {
                 Ok(samples) => clamped.count(samples),
                 Err(error) if jobs.len() == 1 => return Err(error),
                 Err(error) => {
@@ -134,10 +143,12 @@ impl Arguments {
         Ok(())
     }
 
-    /// Denoises one image. Returns the number of negative samples, which were set to 0.
+    /// Denoises one image, by default with the scale of its own exposure. Returns the number of
+    /// negative samples, which were set to 0.
     fn image(
         &self,
         job: &Job,
+        input_scale: Option<f32>,
         bundle: &Bundle,
         layouts: &Layouts,
         progress: &Progress,
@@ -152,12 +163,17 @@ impl Arguments {
             progress.line(format_args!("warning: {name}: {warning}"));
         }
         let tiling = self.tiling.tiling();
+        let options = DenoiseOptions {
+            tiling: tiling.clone(),
+            ensemble: self.ensemble.passes,
+            input_scale,
+        };
         let on_tile = |done, count| {
             if count > 1 {
                 progress.start(format_args!("{name}, tile {} of {count}", done + 1));
             }
         };
-        let denoised = bundle.denoise_tiled(&frame, &tiling, self.ensemble.passes, on_tile)?;
+        let denoised = bundle.denoise_with(&frame, &options, on_tile)?;
         if denoised.tiles.count() > 1 {
             let plan = describe(&denoised.tiles, &tiling);
             progress.line(format_args!("note: {name}: {plan}"));

@@ -35,7 +35,24 @@ pub struct Inputs {
     pub files: Vec<PathBuf>,
     /// Whether the arguments can stand for several files.
     pub several: bool,
+    /// The frame sequences among the arguments.
+    pub sequences: Vec<Sequence>,
 }
+
+/// A frame sequence.
+#[derive(Debug)]
+pub struct Sequence {
+    /// Its chosen frames.
+    pub files: Vec<PathBuf>,
+    /// Up to [`SAMPLES`] of all its frames, evenly spaced: the same for every choice of frames.
+    pub samples: Vec<PathBuf>,
+}
+
+/// Number of frames from which the exposure of a sequence is measured.
+const SAMPLES: usize = 8;
+
+/// Largest number of gaps that a message names.
+const MAX_GAPS: usize = 20;
 
 impl Inputs {
     /// Expands `arguments`.
@@ -49,17 +66,19 @@ impl Inputs {
     pub fn expand(arguments: &[PathBuf], frames: Option<Frames>) -> Result<Self, UsageError> {
         let mut files = Vec::new();
         let mut several = arguments.len() > 1;
-        let mut sequences = 0;
+        let mut sequences = Vec::new();
         for argument in arguments {
             let found = if argument.is_file() {
                 vec![argument.clone()]
             } else if argument.is_dir() {
                 several = true;
                 directory(argument)?
-            } else if let Some(sequence) = Sequence::parse(argument) {
+            } else if let Some(pattern) = SequencePattern::parse(argument) {
                 several = true;
-                sequences += 1;
-                sequence.files(frames)?
+                let sequence = pattern.expand(frames)?;
+                let files = sequence.files.clone();
+                sequences.push(sequence);
+                files
             } else if is_pattern(argument) {
                 several = true;
                 pattern(argument)?
@@ -75,11 +94,15 @@ impl Inputs {
             }
             files.extend(found);
         }
-        if frames.is_some() && sequences == 0 {
+        if frames.is_some() && sequences.is_empty() {
             let message = "--frames needs a sequence among the inputs, such as shot.####.exr";
             return Err(UsageError(message.into()));
         }
-        Ok(Self { files, several })
+        Ok(Self {
+            files,
+            several,
+            sequences,
+        })
     }
 }
 
@@ -122,8 +145,8 @@ fn pattern(argument: &Path) -> Result<Vec<PathBuf>, UsageError> {
     Ok(files)
 }
 
-/// A frame sequence: `directory/PREFIX####SUFFIX`.
-struct Sequence<'a> {
+/// The name of a frame sequence: `directory/PREFIX####SUFFIX`.
+struct SequencePattern<'a> {
     argument: &'a Path,
     prefix: String,
     /// Number of digits of a frame number with leading zeros.
@@ -131,7 +154,7 @@ struct Sequence<'a> {
     suffix: String,
 }
 
-impl<'a> Sequence<'a> {
+impl<'a> SequencePattern<'a> {
     fn parse(argument: &'a Path) -> Option<Self> {
         let name = argument.file_name()?.to_str()?;
         let (start, end, digits) = hashes(name).or_else(|| percent(name))?;
@@ -143,7 +166,7 @@ impl<'a> Sequence<'a> {
         })
     }
 
-    fn files(&self, frames: Option<Frames>) -> Result<Vec<PathBuf>, UsageError> {
+    fn expand(&self, frames: Option<Frames>) -> Result<Sequence, UsageError> {
         let parent = match self.argument.parent() {
             Some(parent) if parent != Path::new("") => parent,
             _ => Path::new("."),
@@ -151,15 +174,20 @@ impl<'a> Sequence<'a> {
         let mut found: Vec<(u64, PathBuf)> = entries(parent)?
             .into_iter()
             .filter_map(|path| Some((self.number(path.file_name()?.to_str()?)?, path)))
-            .filter(|(number, _)| {
-                frames.is_none_or(|frames| (frames.first..=frames.last).contains(number))
-            })
             .collect();
         found.sort();
+        let samples = found.iter().step_by(found.len().div_ceil(SAMPLES).max(1));
+        let samples = samples.map(|(_, path)| path.clone()).collect();
+        if let Some(frames) = frames {
+            found.retain(|(number, _)| (frames.first..=frames.last).contains(number));
+        }
         if let Some(missing) = missing(&found, frames) {
             eprintln!("note: {}: {missing}", self.argument.display());
         }
-        Ok(found.into_iter().map(|(_, path)| path).collect())
+        Ok(Sequence {
+            files: found.into_iter().map(|(_, path)| path).collect(),
+            samples,
+        })
     }
 
     /// The frame number in a file name: exactly `digits` digits, or more without a leading zero.
@@ -193,11 +221,35 @@ fn percent(name: &str) -> Option<(usize, usize, usize)> {
     (name[..end].ends_with('d')).then(|| (start, end, width.parse().unwrap_or(1)))
 }
 
+/// Names the missing frames: `2 of 5 frames are missing: 5-6`.
 fn missing(found: &[(u64, PathBuf)], frames: Option<Frames>) -> Option<String> {
     let first = frames.map_or(found.first()?.0, |frames| frames.first);
     let last = frames.map_or(found.last()?.0, |frames| frames.last);
-    let missing = (last - first + 1).saturating_sub(found.len() as u64);
-    (missing > 0).then(|| format!("{missing} of the frames {first} to {last} are missing"))
+    let mut gaps = Vec::new();
+    let mut missing = 0;
+    let mut next = first;
+    let end = [last.saturating_add(1)];
+    for number in found.iter().map(|(number, _)| *number).chain(end) {
+        if number > next {
+            missing += number - next;
+            gaps.push(match number - next {
+                1 => format!("{next}"),
+                _ => format!("{next}-{}", number - 1),
+            });
+        }
+        next = number.saturating_add(1);
+    }
+    let frames = last - first;
+    (missing > 0).then(|| {
+        let hidden = gaps.len().saturating_sub(MAX_GAPS);
+        gaps.truncate(MAX_GAPS);
+        let more = if hidden > 0 { ", ..." } else { "" };
+        let gaps = gaps.join(", ");
+        format!(
+            "{missing} of {} frames are missing: {gaps}{more}",
+            frames.saturating_add(1)
+        )
+    })
 }
 
 #[cfg(test)]
@@ -281,7 +333,9 @@ mod tests {
     fn gaps_are_counted() {
         let found: Vec<_> = [3, 4, 7].map(|n| (n, PathBuf::new())).into();
         let message = missing(&found, None).expect("a gap");
-        assert_eq!(message, "2 of the frames 3 to 7 are missing");
+        assert_eq!(message, "2 of 5 frames are missing: 5-6");
+        let message = missing(&found, "1-9".parse().ok()).expect("gaps");
+        assert_eq!(message, "6 of 9 frames are missing: 1-2, 5-6, 8-9");
         assert_eq!(missing(&found[..2], None), None);
     }
 }

@@ -120,7 +120,13 @@ mod tests {
 
     fn jobs(files: Vec<PathBuf>, output: &Path) -> Result<Jobs, UsageError> {
         let several = files.len() > 1;
-        Jobs::new(&Inputs { files, several }, output)
+        let sequences = Vec::new();
+        let inputs = Inputs {
+            files,
+            several,
+            sequences,
+        };
+        Jobs::new(&inputs, output)
     }
 
     fn outputs(inputs: &[&str], output: &str) -> Result<Vec<PathBuf>, String> {

@@ -67,17 +67,7 @@ impl Layouts<'_> {
         let missing = bundle.missing();
         if let Some(given) = &self.given {
             let mut layout = given.in_file(file, layer)?.into_owned();
-            let policies = &mut layout.missing;
-            for (own, model) in [
-                (&mut policies.normal, missing.normal),
-                (&mut policies.position, missing.position),
-                (&mut policies.texture1, missing.texture1),
-                (&mut policies.texture2, missing.texture2),
-            ] {
-                if *own == Missing::Error {
-                    *own = model;
-                }
-            }
+            layout.missing = layout.missing.or(missing);
             return Ok(layout);
         }
         let own = &bundle.meta.layout;

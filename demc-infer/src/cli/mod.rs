@@ -8,6 +8,7 @@ mod cost;
 mod denoise;
 mod evaluate;
 mod export;
+mod exposure;
 mod flags;
 mod import;
 mod inputs;

@@ -4,9 +4,11 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use demc_data::{Dataset, Rgb, Scene};
+use demc_infer::denoise::DenoiseOptions;
 use demc_infer::report::SceneImages;
-use demc_infer::{Baseline, BaselineError, Ensemble, ImageScore, Report, Tiling, baseline};
+use demc_infer::{Baseline, BaselineError, Ensemble, ImageScore, Report, baseline};
 
+use super::exposure::InputScaleFlag;
 use super::flags::{DeviceFlag, EnsembleFlag, ModelFlag};
 use super::layouts::LayoutFlags;
 use super::progress::Progress;
@@ -29,6 +31,8 @@ pub struct Scenes {
     /// channels R, G, B and the scene's file name. The flag can be repeated
     #[arg(long = "baseline", value_name = "NAME=DIR")]
     baselines: Vec<Baseline>,
+    #[command(flatten)]
+    input_scale: InputScaleFlag,
     #[command(flatten)]
     ensemble: EnsembleFlag,
     #[command(flatten)]
@@ -84,6 +88,11 @@ impl Scenes {
         let progress = Progress::new(scenes.len());
         let mut images = Vec::with_capacity(scenes.len());
         let mut clamped = Clamped::default();
+        let options = DenoiseOptions {
+            ensemble: self.ensemble.passes,
+            input_scale: self.input_scale.choice.factor(),
+            ..DenoiseOptions::default()
+        };
         for scene in &scenes {
             progress.start(&scene.name);
             let mut frame = demc_data::read_frame(&scene.path, layout)?;
@@ -96,9 +105,7 @@ impl Scenes {
                 .zip(&others)
                 .map(|(baseline, image)| (baseline.name.as_str(), image.planes.as_slice()))
                 .collect();
-            let tiling = Tiling::default();
-            let denoised =
-                bundle.denoise_tiled(&frame, &tiling, self.ensemble.passes, |_, _| ())?;
+            let denoised = bundle.denoise_with(&frame, &options, |_, _| ())?;
             let denoised = denoised.color_hdr;
             let residual = scene.ref_residual_relmse;
             let scene_images = SceneImages {

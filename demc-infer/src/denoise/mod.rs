@@ -1,13 +1,14 @@
-//! Denoises a frame: padding and tiles, gamma, albedo demodulation and Z-score, the network, and
-//! back to linear HDR.
+//! Denoises a frame: exposure and positions, padding and tiles, gamma, albedo demodulation and
+//! Z-score, the network, and back to linear HDR.
 
+mod exposure;
 mod seams;
 #[cfg(test)]
 mod tests;
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
-use demc_data::{FEATURES, Frame};
+use demc_data::{FEATURES, Frame, PositionMap};
 use demc_model::config::COLOR_CHANNELS;
 
 use crate::Bundle;
@@ -18,7 +19,20 @@ use crate::padding::Padding;
 use crate::tiles::{Tiles, Tiling};
 
 pub use crate::error::DenoiseError;
+pub use exposure::{MAX_INPUT_SCALE, input_scale};
 pub use seams::SeamError;
+
+/// How a frame is denoised.
+#[derive(Debug, Clone, Default)]
+pub struct DenoiseOptions {
+    /// Tiles of a large image.
+    pub tiling: Tiling,
+    /// Test-time augmentation.
+    pub ensemble: Ensemble,
+    /// Factor on the colour before the network; the output is divided by it. `None`: the image's
+    /// own [`Bundle::input_scale`].
+    pub input_scale: Option<f32>,
+}
 
 /// A denoised image, and how it was made.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,26 +60,33 @@ impl Bundle {
     /// As [`check_statistics`](Self::check_statistics). Further: the smallest tile does not fit
     /// into the available memory, the device fails, or the output is not finite.
     pub fn denoise(&self, frame: &Frame) -> Result<Vec<f32>, DenoiseError> {
-        self.denoise_tiled(frame, &Tiling::default(), Ensemble::One, |_, _| ())
+        self.denoise_with(frame, &DenoiseOptions::default(), |_, _| ())
             .map(|denoised| denoised.color_hdr)
     }
 
-    /// As [`denoise`](Self::denoise), with a choice of tiles and of test-time augmentation.
+    /// As [`denoise`](Self::denoise), with options.
     ///
     /// `progress` is called before each tile with the number of finished tiles and of all tiles.
     ///
     /// # Errors
     /// As [`denoise`](Self::denoise).
-    pub fn denoise_tiled(
+    pub fn denoise_with(
         &self,
         frame: &Frame,
-        tiling: &Tiling,
-        ensemble: Ensemble,
+        options: &DenoiseOptions,
         progress: impl FnMut(usize, usize),
     ) -> Result<Denoised, DenoiseError> {
-        let input = FrameInput {
+        let DenoiseOptions {
+            tiling,
             ensemble,
-            ..FrameInput::new(self, frame)?
+            input_scale,
+        } = options;
+        let ensemble = *ensemble;
+        let mut input = FrameInput::new(self, frame)?;
+        input.ensemble = ensemble;
+        input.scale = match input_scale {
+            Some(scale) => *scale,
+            None => self.input_scale(demc_data::ranges::exposure(&frame.color)),
         };
         self.check_statistics(frame)?;
         let tiles = self
@@ -86,7 +107,23 @@ impl Bundle {
         })
     }
 
-    /// The tiles that [`denoise_tiled`](Self::denoise_tiled) would cut an image of `height` x
+    /// The output of an ONNX graph of this network ([`crate::onnx`]) for `frame`: as
+    /// [`denoise`](Self::denoise), but without the factor on the colour and the mapping of the
+    /// positions.
+    ///
+    /// # Errors
+    /// As [`denoise`](Self::denoise).
+    pub(crate) fn run_graph(&self, frame: &Frame) -> Result<Vec<f32>, DenoiseError> {
+        let input = FrameInput {
+            positions: None,
+            ..FrameInput::new(self, frame)?
+        };
+        let padded = (input.padding.padded_height(), input.padding.padded_width());
+        let tiles = Tiles::plan(padded, &Tiling::default(), |_, _| 0, None);
+        input.denoise(&tiles.expect("no limit on memory"), |_, _| ())
+    }
+
+    /// The tiles that [`denoise_with`](Self::denoise_with) would cut an image of `height` x
     /// `width` pixels into now.
     ///
     /// # Errors
@@ -154,6 +191,10 @@ struct FrameInput<'a> {
     padding: Padding,
     device: Device,
     ensemble: Ensemble,
+    /// Factor on the colour before the network.
+    scale: f32,
+    /// Where a model takes positions relative to the image.
+    positions: Option<PositionMap>,
 }
 
 /// Rows or columns of the padded image, in pixels.
@@ -172,6 +213,8 @@ impl<'a> FrameInput<'a> {
             },
             device: bundle.device(),
             ensemble: Ensemble::One,
+            scale: 1.0,
+            positions: bundle.meta.normalizer.position_map(&frame.features),
         })
     }
 
@@ -211,9 +254,8 @@ impl<'a> FrameInput<'a> {
         let mut color = self
             .padding
             .cut(&frame.color, rows.clone(), columns.clone());
-        let mut features = self
-            .padding
-            .cut(&frame.features, rows.clone(), columns.clone());
+        color.iter_mut().for_each(|value| *value *= self.scale);
+        let mut features = self.features(rows, columns);
         let modulation = normalizer.modulation(&features);
         normalizer.color_gamma_from_hdr(&mut color, modulation.as_deref());
         normalizer.features_z_from_raw(&mut features);
@@ -229,13 +271,21 @@ impl<'a> FrameInput<'a> {
         let nan: Vec<usize> = (0..out.len()).filter(|i| out[*i].is_nan()).collect();
         normalizer.color_hdr_from_gamma(&mut out, modulation.as_deref());
         nan.into_iter().for_each(|i| out[i] = f32::NAN);
+        out.iter_mut().for_each(|value| *value /= self.scale);
         Ok(out)
     }
 
+    fn features(&self, rows: &PixelRange, columns: &PixelRange) -> Vec<f32> {
+        let features = &self.frame.features;
+        let mut features = self.padding.cut(features, rows.clone(), columns.clone());
+        if let Some(positions) = &self.positions {
+            positions.apply(&mut features);
+        }
+        features
+    }
+
     fn features_z(&self, rows: PixelRange, columns: PixelRange) -> Tensor<4> {
-        let mut planes = self
-            .padding
-            .cut(&self.frame.features, rows.clone(), columns.clone());
+        let mut planes = self.features(&rows, &columns);
         self.bundle.meta.normalizer.features_z_from_raw(&mut planes);
         self.tensor::<FEATURES>(planes, &rows, &columns)
     }

@@ -15,6 +15,21 @@ fn difference(image: &[f32], expected: &[f32]) -> f32 {
     largest(&mut pairs.map(|(a, b)| (a - b).abs())) / largest(&mut expected.iter().copied())
 }
 
+/// Denoises without a factor on the colour.
+fn denoise(
+    bundle: &Bundle,
+    frame: &Frame,
+    tiling: &Tiling,
+    ensemble: Ensemble,
+) -> Result<Denoised, DenoiseError> {
+    let options = DenoiseOptions {
+        tiling: tiling.clone(),
+        ensemble,
+        input_scale: Some(1.0),
+    };
+    bundle.denoise_with(frame, &options, |_, _| ())
+}
+
 #[test]
 fn outputs_have_the_size_of_their_inputs() {
     let bundle = bundle(Variant::Demc);
@@ -70,7 +85,7 @@ fn demodulation_equals_a_division_by_hand() {
         (Tiling::default(), Ensemble::Four),
     ] {
         let denoise = |bundle: &Bundle, frame| {
-            let denoised = bundle.denoise_tiled(frame, &tiling, ensemble, |_, _| ());
+            let denoised = denoise(bundle, frame, &tiling, ensemble);
             denoised.expect("denoised").color_hdr
         };
         let light = denoise(&plain, &divided);
@@ -124,9 +139,7 @@ fn tiles_with_the_exact_halo_are_the_whole_image() {
                 side: Some(side),
                 ..Tiling::default()
             };
-            let tiled = bundle
-                .denoise_tiled(&frame, &tiling, Ensemble::One, |_, _| ())
-                .expect("tiled");
+            let tiled = denoise(&bundle, &frame, &tiling, Ensemble::One).expect("tiled");
             assert!(tiled.tiles.count() >= 6 && tiled.seam_error.is_none());
             let difference = difference(&tiled.color_hdr, &whole);
             assert!(difference <= 2e-6, "{variant:?} {side}: {difference}");
@@ -144,9 +157,7 @@ fn a_smaller_halo_is_measured_and_is_worse() {
             side: Some(256),
             ..Tiling::default()
         };
-        let denoised = bundle
-            .denoise_tiled(&frame, &tiling, Ensemble::One, |_, _| ())
-            .expect("tiled");
+        let denoised = denoise(&bundle, &frame, &tiling, Ensemble::One).expect("tiled");
         denoised.seam_error.expect("it is not exact")
     };
     let (none, some, most) = (error(0), error(64), error(160));
@@ -167,7 +178,7 @@ fn little_memory_makes_tiles_and_too_little_an_error() {
             memory: Some(memory),
             ..Tiling::default()
         };
-        bundle.denoise_tiled(&frame, &tiling, Ensemble::One, |_, _| ())
+        denoise(&bundle, &frame, &tiling, Ensemble::One)
     };
     let whole = within(u64::MAX).expect("no limit");
     assert_eq!(whole.tiles.count(), 1);
@@ -189,9 +200,11 @@ fn every_tile_is_announced() {
     let mut heard = Vec::new();
     let bundle = bundle(Variant::ColorOnly);
     let frame = frame(64, 40);
-    let denoised = bundle.denoise_tiled(&frame, &tiling, Ensemble::One, |done, of| {
-        heard.push((done, of))
-    });
+    let options = DenoiseOptions {
+        tiling,
+        ..DenoiseOptions::default()
+    };
+    let denoised = bundle.denoise_with(&frame, &options, |done, of| heard.push((done, of)));
     assert!(denoised.is_ok());
     assert_eq!(heard, [(0, 4), (1, 4), (2, 4), (3, 4)]);
 }
@@ -220,7 +233,7 @@ fn an_ensemble_does_not_mind_how_an_image_is_held() {
     };
     let changed = |ensemble| {
         let image = |frame: &Frame| {
-            let denoised = bundle.denoise_tiled(frame, &Tiling::default(), ensemble, |_, _| ());
+            let denoised = denoise(&bundle, frame, &Tiling::default(), ensemble);
             denoised.expect("denoised").color_hdr
         };
         difference(&image(&lying), &turned(&image(&upright), width, height))
@@ -238,7 +251,7 @@ fn an_ensemble_of_tiles_is_that_of_the_whole_image() {
             side,
             ..Tiling::default()
         };
-        let denoised = bundle.denoise_tiled(&frame, &tiling, Ensemble::Eight, |_, _| ());
+        let denoised = denoise(&bundle, &frame, &tiling, Ensemble::Eight);
         let denoised = denoised.expect("denoised");
         (denoised.tiles.count(), denoised.color_hdr)
     };
@@ -246,4 +259,76 @@ fn an_ensemble_of_tiles_is_that_of_the_whole_image() {
     assert!(one == 1 && some >= 8);
     let difference = difference(&tiled, &whole);
     assert!(difference <= 2e-6, "{difference}");
+}
+
+/// Colour times a factor gives the image times that factor, up to float32 rounding.
+#[test]
+fn the_exposure_of_an_image_does_not_matter() {
+    let mut bundle = bundle(Variant::Demc);
+    let frame = frame(70, 40);
+    let ranges = demc_data::Ranges::of(&[demc_data::FrameSummary::of(&frame)]);
+    bundle.meta.ranges = Some(ranges);
+    let expected = bundle.denoise(&frame).expect("denoised");
+    for factor in [1e-3, 0.3, 1e3] {
+        let mut scaled = frame.clone();
+        scaled.color.iter_mut().for_each(|x| *x *= factor);
+        let mut found = bundle.denoise(&scaled).expect("denoised");
+        found.iter_mut().for_each(|x| *x /= factor);
+        let difference = difference(&found, &expected);
+        assert!(difference < 1e-5, "{factor}: {difference}");
+    }
+    let options = DenoiseOptions {
+        input_scale: Some(4.0),
+        ..DenoiseOptions::default()
+    };
+    let other = bundle.denoise_with(&frame, &options, |_, _| ());
+    assert!(difference(&other.expect("denoised").color_hdr, &expected) > 1e-3);
+}
+
+#[test]
+fn a_black_image_stays_finite_and_has_scale_one() {
+    let mut bundle = bundle(Variant::Demc);
+    let mut frame = frame(40, 40);
+    let ranges = demc_data::Ranges::of(&[demc_data::FrameSummary::of(&frame)]);
+    bundle.meta.ranges = Some(ranges);
+    assert_eq!(bundle.input_scale(0.0), 1.0);
+    assert_eq!(bundle.input_scale(1e-300), MAX_INPUT_SCALE);
+    frame.color.fill(0.0);
+    assert!(bundle.denoise(&frame).is_ok());
+}
+
+/// A bundle whose positions are relative to the image takes any origin and unit, in tiles, too.
+#[test]
+fn positions_of_any_origin_and_unit_give_the_same_image() {
+    let mut bundle = bundle(Variant::Demc);
+    bundle.meta.normalizer.position = demc_data::PositionSpace::Image;
+    let original = frame(100, 70);
+    let expected = bundle.denoise(&original).expect("denoised");
+    let pixels = 100 * 70;
+    for (factor, offset) in [(1024.0, 0.0), (1.0, 64.0), (1e-3, 1.0)] {
+        let mut moved = original.clone();
+        for x in &mut moved.features[3 * pixels..6 * pixels] {
+            *x = *x * factor + offset;
+        }
+        let tiling = Tiling {
+            side: Some(64),
+            ..Tiling::default()
+        };
+        let found = denoise(&bundle, &moved, &tiling, Ensemble::One).expect("denoised");
+        let difference = difference(&found.color_hdr, &expected);
+        assert!(difference < 1e-3, "{factor} {offset}: {difference}");
+    }
+}
+
+#[test]
+fn albedo_above_one_counts_as_one() {
+    let mut bundle = bundle(Variant::Demc);
+    bundle.meta.normalizer.albedo_demodulation_epsilon = Some(0.07);
+    let mut bright = frame(40, 40);
+    let first = demc_data::frame::TEXTURES * 40 * 40;
+    bright.features[first] = 90.0;
+    let mut white = bright.clone();
+    white.features[first] = 1.0;
+    let image = |frame| bundle.denoise(frame).expect("denoised");
+    assert_eq!(image(&bright), image(&white));
 }

@@ -1,8 +1,7 @@
 //! Compares an image's statistics with the ranges of the training scenes.
 
 use demc_data::frame::FEATURE_NAMES;
-use demc_data::ranges::Range;
-use demc_data::{FrameSummary, Ranges};
+use demc_data::{FrameSummary, PositionSpace, Ranges};
 
 use super::Warning;
 
@@ -14,10 +13,6 @@ const MAX_DISTANCE: f64 = 1.0;
 /// Largest ratio of a deviation to the training scenes' largest (ours; the test scenes' maximum is
 /// 1.5).
 const MAX_DEVIATION_RATIO: f64 = 3.0;
-
-/// Largest distance of the exposure from the training scenes' range, in stops (ours; the test
-/// scenes' maximum is 0.75).
-const MAX_STOPS: f64 = 1.0;
 
 /// Smallest assumed width of a channel's range, in the channel's unit: for channels that the
 /// training scenes hardly use (ours).
@@ -43,11 +38,15 @@ const BUFFERS: [(&str, &str); 4] = [
     ),
 ];
 
-/// One warning for the exposure and one for each buffer that drifts.
-pub(super) fn warnings(image: &FrameSummary, training: &Ranges) -> Vec<Warning> {
-    let features = BUFFERS
-        .iter()
-        .enumerate()
+/// One warning for each buffer that drifts. Positions are compared in [`PositionSpace::Scene`].
+pub(super) fn warnings(
+    image: &FrameSummary,
+    training: &Ranges,
+    position: PositionSpace,
+) -> Vec<Warning> {
+    let buffers = BUFFERS.iter().enumerate();
+    buffers
+        .filter(|(_, (name, _))| position.is_scene() || *name != "position")
         .filter_map(|(buffer, (_, cause))| {
             let channels = buffer * BUFFER..(buffer + 1) * BUFFER;
             let (channel, found) = channels
@@ -58,10 +57,7 @@ pub(super) fn warnings(image: &FrameSummary, training: &Ranges) -> Vec<Warning> 
                 found,
                 cause,
             })
-        });
-    exposure(image.exposure, training.exposure)
-        .into_iter()
-        .chain(features)
+        })
         .collect()
 }
 
@@ -86,24 +82,6 @@ fn channel_drift(image: &FrameSummary, training: &Ranges, channel: usize) -> Opt
     })
 }
 
-fn exposure(found: f64, training: Range) -> Option<Warning> {
-    let (low, high) = (f64::from(training.low), f64::from(training.high));
-    let (below, above) = ((low / found).log2(), (found / high).log2());
-    let (stops, than) = match below > above {
-        true => (below, "darker than the darkest"),
-        false => (above, "brighter than the brightest"),
-    };
-    // A black image has no exposure.
-    (found > 0.0 && stops > MAX_STOPS).then(|| Warning {
-        what: "colour".into(),
-        found: format!(
-            "it is {stops:.1} stops {than} training scene \
-             (exposure {found:.4}, in the training scenes {low:.4} to {high:.4})"
-        ),
-        cause: "is the exposure or the unit wrong? Scale the radiance before denoising, and back afterwards",
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -125,24 +103,26 @@ mod tests {
         Ranges::of(&scenes)
     }
 
+    fn warnings(image: &FrameSummary, training: &Ranges) -> Vec<Warning> {
+        super::warnings(image, training, PositionSpace::Scene)
+    }
+
     #[test]
     fn an_image_like_the_training_scenes_causes_no_warning() {
         assert_eq!(warnings(&summary(0.2, 3.0, 0.2), &training()), []);
         assert_eq!(warnings(&summary(0.2, -5.0, 0.3), &training()), []);
-        assert_eq!(warnings(&summary(0.0, 3.0, 0.2), &training()), []);
+    }
+
+    #[test]
+    fn any_exposure_and_any_position_relative_to_the_image_is_fine() {
+        assert_eq!(warnings(&summary(2e3, 3.0, 0.2), &training()), []);
+        let far = summary(0.2, 1000.0, 0.2);
+        assert_eq!(super::warnings(&far, &training(), PositionSpace::Image), []);
+        assert_eq!(warnings(&far, &training()).len(), 1);
     }
 
     #[test]
     fn each_drift_is_named_with_its_numbers() {
-        let [exposed] = &warnings(&summary(2.0, 3.0, 0.2), &training())[..] else {
-            panic!("one warning");
-        };
-        assert!(
-            exposed
-                .to_string()
-                .starts_with("colour: it is 2.8 stops brighter"),
-            "{exposed}"
-        );
         let [far] = &warnings(&summary(0.2, 1000.0, 0.2), &training())[..] else {
             panic!("one warning");
         };

@@ -6,7 +6,7 @@
 //!   reference, because the noisy input is unbiased.
 //!
 //! A renderer that writes a wrong buffer causes no error: normals in camera space, normals packed
-//! into 0 to 1, swapped buffers, another exposure. Known mistakes are tested first (`geometry`).
+//! into 0 to 1, swapped buffers. Known mistakes are tested first (`geometry`).
 //! The other channels are compared with the ranges of the training scenes (`drift`).
 
 mod drift;
@@ -35,6 +35,9 @@ pub const FARTHEST_RMS: f64 = 100.0;
 /// Number of channels whose missed pixels are left out, as in the statistics: normal xyz and
 /// position xyz.
 const GEOMETRY: usize = 6;
+
+/// The position channels.
+const POSITIONS: std::ops::Range<usize> = 3..6;
 
 /// One sign that an image differs from the training data.
 #[derive(Debug, Clone, PartialEq)]
@@ -66,7 +69,8 @@ impl Bundle {
         // A buffer with a known mistake also drifts: one warning is enough.
         if let Some(ranges) = &self.meta.ranges {
             let known: Vec<String> = warnings.iter().map(|w| w.what.clone()).collect();
-            let drift = drift::warnings(&FrameSummary::of(frame), ranges);
+            let position = self.meta.normalizer.position;
+            let drift = drift::warnings(&FrameSummary::of(frame), ranges, position);
             let named = |warning: &Warning| known.iter().any(|what| warning.what.contains(what));
             warnings.extend(drift.into_iter().filter(|warning| !named(warning)));
         }
@@ -85,7 +89,10 @@ impl Bundle {
         check_sizes(frame)?;
         let stats = &self.meta.normalizer.features;
         let planes = frame.features.chunks_exact(frame.height * frame.width);
-        for (i, plane) in planes.enumerate() {
+        // Mapped positions cannot be far.
+        let mapped = !self.meta.normalizer.position.is_scene();
+        let planes = planes.enumerate();
+        for (i, plane) in planes.filter(|(i, _)| !(mapped && POSITIONS.contains(i))) {
             let mask = frame.mask.as_deref().filter(|_| i < GEOMETRY);
             let (mean, std) = (stats.mean[i], stats.std[i]);
             let rms = rms_z(plane, mask, f64::from(mean), f64::from(std));

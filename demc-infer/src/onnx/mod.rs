@@ -3,10 +3,14 @@
 //!
 //! - Input `color`, `[batch, 3, height, width]`: noisy radiance in linear HDR; below 0 counts as 0.
 //! - Input `features`, `[batch, 12, height, width]`: raw features, ordered as [`FEATURE_NAMES`].
+//!   Of a model with `normalizer.position = "image"`, positions after [`demc_data::PositionMap`].
 //! - Output `output`, `[batch, 3, height, width]`: radiance in linear HDR, not negative.
 //!
 //! The batch can have any size. Height and width must be multiples of 32; with another size, a
 //! runtime fails at the first skip fusion. The graph contains gamma, Z-score and their inverses.
+//! Two conversions need the whole image, and a batch may hold tiles, so the caller does them:
+//! the colour is multiplied by [`Bundle::input_scale`] and the output divided by it, and positions
+//! are mapped.
 //! Batch normalisation is folded into the convolutions. All variants have both inputs; color-only
 //! ignores the second. Inputs, outputs and all computations are float32; [`Precision::F16`] only
 //! affects the stored weights of the convolutions.
@@ -54,9 +58,11 @@ pub const META: &str = "demc";
 pub const FEATURE_ORDER: &str = "demc.features";
 
 const DOCUMENTATION: &str = "DEMC, a denoiser for Monte Carlo renderings (Yang et al. 2019). \
-    color [batch, 3, height, width] is noisy radiance in linear HDR. \
+    color [batch, 3, height, width] is noisy radiance in linear HDR, times a factor s that brings \
+    mean(luminance^(1/2.2))^2.2 to ranges.exposure.high of the metadata; divide the output by s. \
     features [batch, 12, height, width] are shading normal xyz, world position xyz, and albedo RGB at the \
-    first and at the second intersection, raw, in the renderer's units. \
+    first and at the second intersection, raw, in the renderer's units. If normalizer.position of the \
+    metadata is `image`, positions are clamp((p - median) / median distance from it, -5, 5), and 0 without a hit. \
     output [batch, 3, height, width] is radiance in linear HDR. \
     Height and width must be multiples of 32: repeat the last row and column, and crop the output. \
     Values must be finite. \

@@ -8,6 +8,7 @@ use burn::nn::BatchNorm;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
 use demc_data::Normalizer;
 use demc_data::frame::TEXTURES;
+use demc_data::transform::MAX_ALBEDO;
 use demc_model::config::{COLOR_CHANNELS, FEATURE_CHANNELS, Input};
 use demc_model::decoder::DecoderLevel;
 use demc_model::encoder::EncoderLevel;
@@ -21,9 +22,10 @@ use crate::Precision;
 
 impl GraphBuilder {
     pub(super) fn denoise(&mut self, model: &Denoiser, normalizer: &Normalizer) {
-        let modulation = self.modulation(normalizer);
+        let features = self.albedo_clamped();
+        let modulation = self.modulation(normalizer, &features);
         let color_gamma = self.color_gamma(normalizer.gamma, modulation.as_ref());
-        let features_z = self.features_z(normalizer);
+        let features_z = self.features_z(normalizer, &features);
         let detail = model.fusion.as_ref().map(|fusion| {
             let blocks = fusion.blocks.iter();
             blocks.fold(features_z.clone(), |x, block| self.block(&x, block))
@@ -66,9 +68,18 @@ impl GraphBuilder {
         self.node("Pow", OUTPUT, &[&image, &gamma], &[]);
     }
 
-    /// `(max(albedo, 0) + epsilon)^(1/gamma)` with the albedo of the first hit
+    /// The features with albedo of at most [`MAX_ALBEDO`].
+    fn albedo_clamped(&mut self) -> Value {
+        let mut most = [f32::MAX; FEATURE_CHANNELS];
+        most[TEXTURES..].fill(MAX_ALBEDO);
+        let most = self.constant("features_max", &[1, FEATURE_CHANNELS, 1, 1], &most);
+        let raw = Value(FEATURES.into());
+        self.node("Min", "features_clamped", &[&raw, &most], &[])
+    }
+
+    /// `(clamp(albedo, 0, 1) + epsilon)^(1/gamma)` with the albedo of the first hit
     /// ([`Normalizer::modulation`]).
-    fn modulation(&mut self, normalizer: &Normalizer) -> Option<Value> {
+    fn modulation(&mut self, normalizer: &Normalizer, features: &Value) -> Option<Value> {
         let epsilon = normalizer.albedo_demodulation_epsilon?;
         let first = TEXTURES as i64;
         let bounds = [
@@ -77,8 +88,7 @@ impl GraphBuilder {
             self.integers("texture_axis", &[1]),
         ];
         let [start, end, axis] = &bounds;
-        let raw = Value(FEATURES.into());
-        let texture = self.node("Slice", "texture", &[&raw, start, end, axis], &[]);
+        let texture = self.node("Slice", "texture", &[features, start, end, axis], &[]);
         let positive = self.node("Relu", "texture_positive", &[&texture], &[]);
         let offset = self.constant("demodulate", &[], &[epsilon]);
         let divisor = self.node("Add", "modulation_hdr", &[&positive, &offset], &[]);
@@ -98,12 +108,11 @@ impl GraphBuilder {
     }
 
     /// `(x - mean) / std`, channel by channel.
-    fn features_z(&mut self, normalizer: &Normalizer) -> Value {
+    fn features_z(&mut self, normalizer: &Normalizer, features: &Value) -> Value {
         let shape = [1, FEATURE_CHANNELS, 1, 1];
         let mean = self.constant("features_mean", &shape, &normalizer.features.mean);
         let std = self.constant("features_std", &shape, &normalizer.features.std);
-        let raw = Value(FEATURES.into());
-        let centred = self.node("Sub", "features_centred", &[&raw, &mean], &[]);
+        let centred = self.node("Sub", "features_centred", &[features, &mean], &[]);
         self.node("Div", "features_z", &[&centred, &std], &[])
     }
 

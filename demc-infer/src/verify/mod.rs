@@ -154,7 +154,10 @@ pub fn verify(
         for _ in 0..batch {
             let statistics = &expected.meta.normalizer.features;
             let frame = synthetic_frame([height, width], statistics, &mut rng);
-            output.extend(expected.denoise(&frame)?);
+            output.extend(match runtime {
+                Runtime::OnnxRuntime => expected.run_graph(&frame)?,
+                Runtime::PyTorch => expected.denoise(&frame)?,
+            });
             colors.extend(frame.color);
             features.extend(frame.features);
         }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use burn::tensor::Device;
-use demc_data::{ChannelLayout, FeatureStats, Normalizer};
+use demc_data::{ChannelLayout, FeatureStats, Normalizer, PositionSpace};
 use demc_infer::{Bundle, BundleMeta, Names, Precision};
 use demc_model::{ModelConfig, Reading, Variant};
 use rand_chacha::ChaCha8Rng;
@@ -34,6 +34,7 @@ pub fn random_bundle() -> Bundle {
     let normalizer = Normalizer {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
+        position: PositionSpace::Scene,
         features: FeatureStats {
             mean: [0.2; 12],
             std: [0.7; 12],

@@ -56,14 +56,9 @@ impl RunData {
         let all: Vec<Scene> = train.iter().chain(&validation).cloned().collect();
         // Validation scenes too: another seed may train on them.
         demc_data::patch::patches(&all, *patch_size, *stride, *border)?;
-        let statistics = Statistics::measure(
-            &train,
-            &layout,
-            config.data.gamma,
-            config.data.albedo_demodulation_epsilon,
-            config.loss.relmse_epsilon,
-        )
-        .context("measuring the training scenes")?;
+        let statistics =
+            Statistics::measure(&train, &layout, &config.data, config.loss.relmse_epsilon)
+                .context("measuring the training scenes")?;
         let mut clamped = statistics.clamped;
         for scene in validation.iter().chain(&test) {
             // Now, not after days of training.

@@ -1,0 +1,119 @@
+//! `--input-scale`: the factor on the colour before the network.
+
+use std::collections::HashMap;
+use std::path::Path;
+use std::str::FromStr;
+
+use clap::Args;
+use demc_data::exr::ExrFile;
+use demc_data::ranges::exposure;
+use demc_infer::Bundle;
+use demc_infer::denoise::MAX_INPUT_SCALE;
+
+use super::inputs::Sequence;
+use super::layouts::Layouts;
+
+/// `--input-scale`.
+#[derive(Args)]
+pub struct InputScaleFlag {
+    /// Factor on the colour before the network; the result is divided by it. `auto` brings each
+    /// image, or the median frame of a sequence, to the exposure of the training scenes
+    #[arg(
+        long = "input-scale",
+        value_name = "auto|FACTOR",
+        default_value = "auto"
+    )]
+    pub choice: InputScale,
+}
+
+/// The value of `--input-scale`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum InputScale {
+    /// From the exposure of the image or sequence.
+    Auto,
+    /// This factor.
+    Factor(f32),
+}
+
+impl InputScale {
+    /// The factor, if it was given.
+    pub fn factor(self) -> Option<f32> {
+        match self {
+            Self::Auto => None,
+            Self::Factor(factor) => Some(factor),
+        }
+    }
+}
+
+impl FromStr for InputScale {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text == "auto" {
+            return Ok(Self::Auto);
+        }
+        let allowed = 1.0 / MAX_INPUT_SCALE..=MAX_INPUT_SCALE;
+        match text.parse() {
+            Ok(factor) if allowed.contains(&factor) => Ok(Self::Factor(factor)),
+            _ => Err("expected auto, or a factor from 0.000001 to 1000000".to_owned()),
+        }
+    }
+}
+
+/// One factor for each sequence.
+pub struct SequenceScales<'a> {
+    sequences: &'a [Sequence],
+    /// By the index of the sequence.
+    scales: HashMap<usize, f32>,
+}
+
+impl<'a> SequenceScales<'a> {
+    pub fn new(sequences: &'a [Sequence]) -> Self {
+        Self {
+            sequences,
+            scales: HashMap::new(),
+        }
+    }
+
+    /// The factor for the frames of the sequence with `path`; `None` if it is in no sequence.
+    pub fn of(&mut self, path: &Path, bundle: &Bundle, layouts: &Layouts) -> Option<f32> {
+        let mut sequences = self.sequences.iter();
+        let index =
+            sequences.position(|sequence| sequence.files.iter().any(|file| file == path))?;
+        let scale = self.scales.entry(index).or_insert_with(|| {
+            let samples = self.sequences[index].samples.iter();
+            // An unreadable frame is reported when its turn comes.
+            let exposures = samples.filter_map(|path| exposure_of(path, bundle, layouts).ok());
+            let mut exposures: Vec<f64> = exposures.filter(|exposure| *exposure > 0.0).collect();
+            exposures.sort_by(f64::total_cmp);
+            let median = exposures.get(exposures.len() / 2);
+            bundle.input_scale(median.copied().unwrap_or(0.0))
+        });
+        Some(*scale)
+    }
+}
+
+/// The exposure of an image, from its colour alone.
+fn exposure_of(path: &Path, bundle: &Bundle, layouts: &Layouts) -> Result<f64, demc_data::Error> {
+    let mut file = ExrFile::open(path)?;
+    let layout = layouts.of(&file, bundle, |_| ())?;
+    let names = layout.color.each_ref().map(String::as_str);
+    file.require(&names)?;
+    let planes = file.read(&names)?;
+    let color: Vec<f32> = planes.iter().flat_map(|plane| plane.to_f32()).collect();
+    Ok(exposure(&color))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_scale_is_auto_or_a_positive_number() {
+        assert_eq!("auto".parse(), Ok(InputScale::Auto));
+        assert_eq!("0.25".parse(), Ok(InputScale::Factor(0.25)));
+        for wrong in ["0", "-1", "nan", "inf", "1e9", "x", ""] {
+            assert!(wrong.parse::<InputScale>().is_err(), "{wrong}");
+        }
+    }
+}
