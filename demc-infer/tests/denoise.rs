@@ -163,8 +163,7 @@ fn channels_that_do_not_fit_the_layout_are_listed() {
         .expect("written");
     let outcome = denoise(run.path(), &[&input], &dir.path().join("out.exr"));
     assert_eq!(outcome.code, 1);
-    outcome.says("no channel normal.X");
-    outcome.says("the file has B, G, R");
+    outcome.says("the nearest, demc-exr, lacks normal.X");
 }
 
 #[test]
@@ -254,7 +253,7 @@ fn a_sequence_is_denoised_frame_by_frame() {
         dir.path().join("shot ü.####.exr")
     ];
     let outcome = demc_infer(list).success();
-    outcome.says("1 of the frames 9 to 12 are missing\n");
+    outcome.says("1 of 4 frames are missing: 11\n");
     let mut names: Vec<_> = fs::read_dir(&out)
         .expect("made")
         .map(|entry| entry.expect("entry").file_name())

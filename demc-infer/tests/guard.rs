@@ -67,12 +67,6 @@ fn test_scenes_pass_and_mistakes_are_named() {
             "{}: {swapped}",
             frame.name
         );
-        let bright = with(&|frame| frame.color.iter_mut().for_each(|x| *x *= 100.0));
-        assert!(
-            bright.contains("stops brighter"),
-            "{}: {bright}",
-            frame.name
-        );
         let centimetres = with(&|frame| {
             let positions = frame.features[3 * pixels..6 * pixels].iter_mut();
             positions.for_each(|x| *x *= 100.0);
@@ -107,7 +101,7 @@ fn check_prints_the_table_and_fails_on_a_warning() {
     let ranges = strict.meta.ranges.as_mut().expect("they were set");
     ranges.mean[6] = demc_data::ranges::Range {
         low: 1e6,
-        high: 2e6,
+        high: 1e6 + 1.0,
     };
     strict
         .save(&model, Names::Burn, Precision::F32)

@@ -17,11 +17,19 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from torch.nn import functional as F
 
-from .metrics import gamma_from_hdr, hdr_from_gamma
+from .metrics import GAMMA, gamma_from_hdr, hdr_from_gamma
 from .network import FEATURES, SIZE_MULTIPLE, Denoiser, ModelConfig
 
 FORMAT = 1
 """The bundle format that this package reads."""
+MAX_ALBEDO = 1.0
+"""Larger albedo counts as this."""
+MAX_INPUT_SCALE = 1e6
+"""Largest factor on the colour, and the inverse of the smallest."""
+FARTHEST = 5.0
+"""Largest absolute position relative to the image."""
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+"""Rec. 709 luminance of red, green and blue."""
 TORCH_FROM_BURN = {"gamma": "weight", "beta": "bias"}
 """Last part of a batch-normalisation key: Burn's name to PyTorch's."""
 
@@ -38,29 +46,59 @@ class Bundle:
     meta: dict  # the whole header
     demodulate: float = 0.0  # epsilon of albedo demodulation; 0: off
 
+    def input_scale(self, color_hdr: np.ndarray) -> float:
+        """The factor that brings colour [3, H, W] to the exposure of the brightest training scenes.
+
+        1 for a black image and for a bundle without ranges. One factor serves a whole sequence and
+        all tiles of an image.
+        """
+        ranges = self.meta.get("ranges")
+        exposure = exposure_of(color_hdr)
+        if ranges is None or exposure == 0:
+            return 1.0
+        scale = ranges["exposure"]["high"] / exposure
+        return float(np.float32(np.clip(scale, 1 / MAX_INPUT_SCALE, MAX_INPUT_SCALE)))
+
+    def map_positions(self, features: np.ndarray) -> np.ndarray:
+        """Features [12, H, W] with the positions that the network takes as input.
+
+        In the position space "image", positions are centred at their median and divided by the
+        median distance from it; without a hit they are 0. The whole image must be given.
+        """
+        if self.meta["normalizer"].get("position", "scene") == "scene":
+            return features
+        features = np.array(features, np.float32)
+        hit = (features[:6] != 0).any(0)
+        features[3:6] = relative_positions(features[3:6], hit)
+        return features
+
     def modulation(self, features: Tensor) -> Tensor:
         """The factor of albedo demodulation, in gamma space.
 
         [B, 12, H, W] features as rendered -> [B, 3, H, W]. The network's input colour is divided by
         it and its output multiplied by it. All ones if `demodulate` is 0.
         """
-        texture = features[:, 6:9]
+        texture = features[:, 6:9].clamp(0, MAX_ALBEDO)
         if self.demodulate == 0:
             return torch.ones_like(texture)
-        return gamma_from_hdr(texture.clamp_min(0) + self.demodulate, self.gamma)
+        return gamma_from_hdr(texture + self.demodulate, self.gamma)
 
     def features_z_from_raw(self, features: Tensor) -> Tensor:
         """[B, 12, H, W] features as rendered -> Z-scored."""
         shape = (1, FEATURES, 1, 1)
+        features = torch.cat((features[:, :6], features[:, 6:].clamp_max(MAX_ALBEDO)), 1)
         return (features - self.feature_mean.view(shape)) / self.feature_std.view(shape)
 
     @torch.inference_mode()
-    def denoise(self, color_hdr: np.ndarray, features: np.ndarray) -> np.ndarray:
+    def denoise(
+        self, color_hdr: np.ndarray, features: np.ndarray, input_scale: float | None = None
+    ) -> np.ndarray:
         """Denoises one image of any size.
 
         `color_hdr` is [3, H, W] linear radiance. `features` is [12, H, W] as rendered: normal,
         position, albedo (first hit), albedo (second hit). Returns [3, H, W] linear radiance,
-        float32. Edge pixels are repeated up to a multiple of 32 and cropped afterwards.
+        float32. Edge pixels are repeated up to a multiple of 32 and cropped afterwards. The network
+        sees the colour times `input_scale`, by default that of `input_scale(color_hdr)`.
         """
         height, width = color_hdr.shape[-2:]
         for what, array, channels in (("color_hdr", color_hdr, 3), ("features", features, FEATURES)):
@@ -69,13 +107,15 @@ class Bundle:
             if not np.isfinite(array).all():
                 raise ValueError(f"{what} contains NaN or infinite values")
         device = next(self.model.parameters()).device
-        color, feats = (torch.from_numpy(np.float32(a)).to(device)[None] for a in (color_hdr, features))
+        scale = self.input_scale(color_hdr) if input_scale is None else input_scale
+        arrays = np.float32(color_hdr) * np.float32(scale), np.float32(self.map_positions(features))
+        color, feats = (torch.from_numpy(array).to(device)[None] for array in arrays)
         pad = (0, -width % SIZE_MULTIPLE, 0, -height % SIZE_MULTIPLE)
         modulation = self.modulation(feats)
         color_gamma = F.pad(gamma_from_hdr(color, self.gamma) / modulation, pad, mode="replicate")
         features_z = F.pad(self.features_z_from_raw(feats), pad, mode="replicate")
         out = self.model(color_gamma, features_z)[0, :, :height, :width]
-        return hdr_from_gamma(out * modulation[0], self.gamma).cpu().numpy()
+        return hdr_from_gamma(out * modulation[0], self.gamma).cpu().numpy() / np.float32(scale)
 
     def to(self, device: torch.device | str) -> Bundle:
         """Moves the network and the statistics to `device`, in place."""
@@ -130,6 +170,27 @@ def load(path: str | os.PathLike) -> Bundle:
         meta=meta,
         demodulate=demodulate,
     )
+
+
+def exposure_of(color_hdr: np.ndarray) -> float:
+    """``mean(luminance^(1/2.2))^2.2`` of linear colour [3, H, W]; 0 for a black image."""
+    luminance = np.tensordot(LUMINANCE, np.float32(color_hdr), 1)
+    return float(np.mean(np.maximum(luminance, 0).astype(np.float64) ** (1 / GAMMA)) ** GAMMA)
+
+
+def relative_positions(positions: np.ndarray, hit: np.ndarray) -> np.ndarray:
+    """Positions [3, H, W] relative to the image; `hit` [H, W] is true where a surface is hit."""
+    points = positions[:, hit]
+    if points.size == 0:
+        return np.zeros_like(positions)
+    middle = points.shape[1] // 2
+    center = np.partition(points, middle, 1)[:, middle]
+    distances = np.sqrt(((points - center[:, None]) ** 2).sum(0))
+    extent = np.partition(distances, middle)[middle] or distances.mean()
+    if extent == 0:
+        return np.zeros_like(positions)
+    mapped = np.clip((positions - center[:, None, None]) / extent, -FARTHEST, FARTHEST)
+    return np.where(hit, mapped, np.float32(0))
 
 
 def torch_name_from(name: str) -> str:

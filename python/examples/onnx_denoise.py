@@ -12,7 +12,8 @@ import OpenEXR
 
 model, source, target = sys.argv[1:]
 session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-layout = json.loads(session.get_modelmeta().custom_metadata_map["demc"])["layout"]
+meta = json.loads(session.get_modelmeta().custom_metadata_map["demc"])
+layout = meta["layout"]
 channels = OpenEXR.File(source, separate_channels=True).channels()
 
 
@@ -23,9 +24,14 @@ def planes(*buffers):
     return np.pad(image, ((0, 0), (0, -height % 32), (0, -width % 32)), "edge")[None].astype("f4")
 
 
+# The network sees the exposure of the brightest training scenes.
+red, green, blue = (channels[name].pixels.astype("f4").clip(0) for name in layout["color"])
+luminance = 0.2126 * red + 0.7152 * green + 0.0722 * blue
+scale = np.float32(meta["ranges"]["exposure"]["high"] / np.mean(luminance ** (1 / 2.2)) ** 2.2)
 features = planes("normal", "position", "texture1", "texture2")
-[output] = session.run(["output"], {"color": planes("color"), "features": features})
-height, width = channels[layout["color"][0]].pixels.shape
+[output] = session.run(["output"], {"color": planes("color") * scale, "features": features})
+output /= scale
+height, width = red.shape
 rgb = np.ascontiguousarray(output[0, :, :height, :width].transpose(1, 2, 0))
 header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
 OpenEXR.File(header, {"RGB": rgb}).write(target)

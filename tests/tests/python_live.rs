@@ -14,9 +14,9 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
-use demc_data::Frame;
 use demc_data::exr::ExrFile;
 use demc_data::plane::Plane;
+use demc_data::{Frame, Normalizer, PositionSpace};
 use demc_infer::verify::{Runtime, verify};
 use demc_infer::{Bundle, BundleError, BundleFile, Names, Precision};
 use demc_model::{Reading, Variant};
@@ -84,8 +84,17 @@ fn verify_accepts_pytorch_with_either_style_of_names() {
     let folder = TempDir::new().expect("a temporary directory");
     let path = folder.path().join("x.safetensors");
     let mut rng = ChaCha8Rng::seed_from_u64(5);
-    let bundle = random_bundle(Variant::Demc, Reading::Released, MOVE_BY, &mut rng);
+    let mut bundle = random_bundle(Variant::Demc, Reading::Released, MOVE_BY, &mut rng);
     for names in [Names::Torch, Names::Burn] {
+        if names == Names::Burn {
+            // Auto-exposure, demodulation and positions relative to the image.
+            let statistics = bundled_model().meta;
+            bundle.meta.ranges = statistics.ranges;
+            bundle.meta.normalizer = Normalizer {
+                position: PositionSpace::Image,
+                ..statistics.normalizer
+            };
+        }
         bundle
             .export(&path, names, Precision::F32)
             .expect("exported");

@@ -3,10 +3,11 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use demc_data::FrameSummary;
 use demc_data::exr::ExrFile;
-use demc_data::frame::{FEATURE_NAMES, decode_input};
+use demc_data::frame::{FEATURE_NAMES, TEXTURES, decode_input};
 use demc_data::ranges::Range;
+use demc_data::transform::MAX_ALBEDO;
+use demc_data::{Frame, FrameSummary};
 use demc_infer::Bundle;
 use serde::Serialize;
 
@@ -44,6 +45,7 @@ pub struct Arguments {
 struct FileCheck {
     file: PathBuf,
     exposure: CheckedValue,
+    input_scale: f32,
     channels: Vec<ChannelCheck>,
     warnings: Vec<String>,
 }
@@ -116,12 +118,14 @@ impl FileCheck {
             .into_iter()
             .map(|warning| warning.to_string())
             .collect();
+        warnings.extend(bright_albedo(&frame));
         if let Err(refused) = bundle.check_statistics(&frame) {
             warnings.push(format!("`denoise` refuses this image: {refused}"));
         }
         let checked = Self {
             file: path,
             exposure: row(exposure, ranges.map(|ranges| ranges.exposure)),
+            input_scale: bundle.input_scale(exposure),
             channels: channels.collect(),
             warnings,
         };
@@ -151,6 +155,10 @@ impl FileCheck {
                 "",
                 ""
             ),
+            format!(
+                "| {:<10} | {:>9.3} | {:>20} | {:>9} | {:>20} |",
+                "factor", self.input_scale, "", "", ""
+            ),
         ];
         lines.extend(
             self.channels
@@ -172,4 +180,19 @@ impl FileCheck {
         );
         lines.join("\n") + "\n"
     }
+}
+
+/// A warning about albedo above [`MAX_ALBEDO`].
+fn bright_albedo(frame: &Frame) -> Option<String> {
+    let pixels = frame.width * frame.height;
+    let above = |value: &&f32| **value > MAX_ALBEDO;
+    let textures = frame.features[TEXTURES * pixels..].iter();
+    let bright = textures.clone().filter(above).count();
+    let largest = textures.fold(0.0, |largest: f32, value| largest.max(*value));
+    (bright > 0).then(|| {
+        format!(
+            "albedo: {bright} samples are above {MAX_ALBEDO}, up to {largest:.1}, and count as {MAX_ALBEDO}; \
+             is a lamp seen in metal, or is this another buffer?"
+        )
+    })
 }
