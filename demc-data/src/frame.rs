@@ -86,19 +86,36 @@ pub fn decode_input<R: Read + Seek>(
     decode(file, layout, Presence::Skip)
 }
 
+/// As [`decode_input`], but NaN, infinite and negative samples are replaced by the median of their
+/// neighbours ([`Plane::repair`]; negative ones in the colour only). Also returns their number.
+///
+/// # Errors
+/// As [`read_frame`], without [`Error::NonFinite`].
+pub fn decode_repaired<R: Read + Seek>(
+    file: &mut ExrFile<R>,
+    layout: &ChannelLayout,
+) -> Result<(Frame, usize), Error> {
+    let (planes, repaired) =
+        FramePlanes::decode_with(file, layout, Presence::Skip, Presence::IfPresent, true)?;
+    Ok((frame_of(planes, file.path()), repaired))
+}
+
 fn decode<R: Read + Seek>(
     file: &mut ExrFile<R>,
     layout: &ChannelLayout,
     reference: Presence,
 ) -> Result<Frame, Error> {
     let planes = FramePlanes::decode(file, layout, reference, Presence::IfPresent)?;
-    let name = file
-        .path()
+    Ok(frame_of(planes, file.path()))
+}
+
+fn frame_of(planes: FramePlanes, path: &Path) -> Frame {
+    let name = path
         .file_stem()
         .unwrap_or_default()
         .to_string_lossy()
         .into_owned();
-    Ok(Frame {
+    Frame {
         name,
         width: planes.width,
         height: planes.height,
@@ -107,7 +124,7 @@ fn decode<R: Read + Seek>(
         reference: planes.reference.as_deref().map(planar),
         mask: planes.mask.as_ref().map(Plane::to_f32),
         clamped: planes.clamped,
-    })
+    }
 }
 
 /// An image's checked buffers in the precision of the file.
@@ -166,26 +183,48 @@ impl FramePlanes {
         reference: Presence,
         mask: Presence,
     ) -> Result<Self, Error> {
+        Self::decode_with(file, layout, reference, mask, false).map(|(planes, _)| planes)
+    }
+
+    /// As [`decode`](Self::decode), if wanted with repaired samples. Also returns their number.
+    fn decode_with<R: Read + Seek>(
+        file: &mut ExrFile<R>,
+        layout: &ChannelLayout,
+        reference: Presence,
+        mask: Presence,
+        repair: bool,
+    ) -> Result<(Self, usize), Error> {
         let path = &file.path().to_owned();
         let layout = &*layout.in_file(file, None)?;
         let wanted = FrameChannels::new(file, layout, reference, mask)?;
         let window = wanted.window(path, file)?;
         let names = wanted.names();
-        let mut decoded = names
-            .iter()
-            .copied()
-            .zip(file.read(&names)?)
-            .map(|(name, plane)| match plane.non_finite() {
-                None => Ok(plane),
-                Some((index, value, count)) => Err(Error::NonFinite {
-                    path: path.to_owned(),
-                    channel: name.to_owned(),
-                    value,
-                    x: index % window.width,
-                    y: index / window.width,
-                    count,
-                }),
-            });
+        let mut all = file.read(&names)?;
+        let mut repaired = 0;
+        if repair {
+            let colors = wanted.color.len();
+            let size = (window.height, window.width);
+            let planes = all.iter_mut().enumerate();
+            repaired = planes
+                .map(|(i, plane)| plane.repair(size, i < colors))
+                .sum();
+        }
+        let mut decoded =
+            names
+                .iter()
+                .copied()
+                .zip(all)
+                .map(|(name, plane)| match plane.non_finite() {
+                    None => Ok(plane),
+                    Some((index, value, count)) => Err(Error::NonFinite {
+                        path: path.to_owned(),
+                        channel: name.to_owned(),
+                        value,
+                        x: index % window.width,
+                        y: index / window.width,
+                        count,
+                    }),
+                });
         let mut take = |slots: &[Option<&str>]| -> Result<Vec<Plane>, Error> {
             let zeros = || Ok(Plane::zeros(window.width * window.height));
             slots
@@ -207,7 +246,7 @@ impl FramePlanes {
             .iter_mut()
             .chain(planes.reference.iter_mut().flatten());
         planes.clamped = radiance.map(Plane::clamp_negative).sum();
-        Ok(planes)
+        Ok((planes, repaired))
     }
 
     /// Converts the positions to `space` ([`PositionMap`]).

@@ -4,6 +4,9 @@
 use half::f16;
 use half::slice::HalfFloatSliceExt;
 
+/// Largest distance of a neighbour that repairs a sample, in pixels.
+const MAX_RADIUS: usize = 8;
+
 /// The samples of one channel, row by row, `[H, W]`.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Plane {
@@ -74,6 +77,49 @@ impl Plane {
         }
     }
 
+    /// Replaces NaN and infinite samples, and with `negative` those below 0, by the median of the
+    /// other samples around them: in 3x3 pixels, or in the smallest larger square up to 17x17 that
+    /// has any, or in the whole plane. Returns their number. Without any sound sample they become 0.
+    ///
+    /// `size` is height and width.
+    pub fn repair(&mut self, (height, width): (usize, usize), negative: bool) -> usize {
+        let samples = self.to_f32();
+        let is_sound = |x: &f32| x.is_finite() && !(negative && *x < 0.0);
+        let bad: Vec<usize> = (0..samples.len())
+            .filter(|i| !is_sound(&samples[*i]))
+            .collect();
+        let median = |mut sound: Vec<f32>| {
+            sound.sort_by(f32::total_cmp);
+            sound.get(sound.len() / 2).copied()
+        };
+        let mut of_plane = None;
+        for &i in &bad {
+            let (y, x) = (i / width, i % width);
+            let near = (1..=MAX_RADIUS).find_map(|radius| {
+                let rows = y.saturating_sub(radius)..(y + radius + 1).min(height);
+                let columns = x.saturating_sub(radius)..(x + radius + 1).min(width);
+                let rows = rows.map(|y| &samples[y * width..][columns.clone()]);
+                median(rows.flatten().copied().filter(is_sound).collect())
+            });
+            let value = near.unwrap_or_else(|| {
+                *of_plane.get_or_insert_with(|| {
+                    let sound = samples.iter().copied().filter(is_sound);
+                    median(sound.collect()).unwrap_or(0.0)
+                })
+            });
+            self.set(i, value);
+        }
+        bad.len()
+    }
+
+    fn set(&mut self, i: usize, value: f32) {
+        match self {
+            Plane::Half(samples) => samples[i] = f16::from_f32(value),
+            Plane::Float(samples) => samples[i] = value,
+            Plane::Uint(samples) => samples[i] = value as u32,
+        }
+    }
+
     /// Sets negative samples to 0 and returns their number (-0 is not negative).
     pub fn clamp_negative(&mut self) -> usize {
         match self {
@@ -109,6 +155,28 @@ fn clamp<T: PartialOrd + Copy>(samples: &mut [T], zero: T) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_bad_sample_becomes_the_median_of_its_sound_neighbours() {
+        let (nan, inf) = (f32::NAN, f32::INFINITY);
+        let samples = [nan, 1.0, 2.0, -5.0, inf, 3.0];
+        let mut radiance = Plane::Float(samples.to_vec());
+        assert_eq!(radiance.repair((2, 3), true), 3);
+        assert_eq!(radiance, Plane::Float(vec![1.0, 1.0, 2.0, 1.0, 2.0, 3.0]));
+        let mut feature = half(&samples);
+        assert_eq!(feature.repair((2, 3), false), 2);
+        assert_eq!(feature, half(&[1.0, 1.0, 2.0, -5.0, 2.0, 3.0]));
+    }
+
+    #[test]
+    fn far_neighbours_count_if_there_are_no_near_ones() {
+        let mut line = Plane::Float([vec![f32::NAN; 9], vec![7.0]].concat());
+        assert_eq!(line.repair((1, 10), true), 9);
+        assert_eq!(line, Plane::Float(vec![7.0; 10]));
+        let mut none = Plane::Float(vec![f32::NAN; 4]);
+        assert_eq!(none.repair((2, 2), true), 4);
+        assert_eq!(none, Plane::Float(vec![0.0; 4]));
+    }
 
     fn half(samples: &[f32]) -> Plane {
         Plane::Half(samples.iter().map(|&s| f16::from_f32(s)).collect())

@@ -5,7 +5,8 @@ mod support;
 use std::fs;
 use std::path::Path;
 
-use demc_data::exr::MAX_SIDE;
+use demc_data::exr::{ExrFile, MAX_SIDE};
+use demc_data::frame::decode_repaired;
 use demc_data::{ChannelLayout, read_frame};
 use exr::prelude::*;
 use rand::{RngExt, SeedableRng};
@@ -199,5 +200,12 @@ fn nan_and_infinity_are_refused_with_their_place() {
             format!("channel {channel}: {value} at x 2, y 2 (2 NaN or infinite samples in all)");
         let message = refusal(&path);
         assert!(message.ends_with(&expected), "{message}");
+        // The reference is no input of denoising.
+        let bad = if channel == "ref.B" { 0 } else { 2 };
+        let mut file = ExrFile::open(&path).expect("an EXR file");
+        let (frame, repaired) = decode_repaired(&mut file, &layout()).expect("repaired");
+        assert_eq!(repaired, bad, "{channel}");
+        let mut values = frame.color.iter().chain(&frame.features);
+        assert!(values.all(|x| x.is_finite()), "{channel}");
     }
 }

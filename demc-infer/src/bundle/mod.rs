@@ -6,8 +6,9 @@
 //! JSON, with the key `names` added. A single key keeps the bytes reproducible, because the
 //! `safetensors` crate writes metadata in random order.
 //!
-//! Statistics and layout are stored with the weights because every output value depends on them.
-//! Weights without them do not load, and no flag replaces them.
+//! Statistics are stored with the weights because every output value depends on them. Weights
+//! without them do not load, and no flag replaces them. The layout is that of the training data;
+//! another file may have another one.
 
 mod encode;
 mod error;

@@ -8,7 +8,7 @@ use clap::{Args, ValueEnum};
 use demc_data::ChannelLayout;
 use demc_data::exr::rewrite::{OutputChannels, WriteOptions, rewrite};
 use demc_data::exr::{Compression, ExrFile};
-use demc_data::frame::decode_input;
+use demc_data::frame::{decode_input, decode_repaired};
 use demc_infer::denoise::{DenoiseOptions, SeamError};
 use demc_infer::guard::EnergyBias;
 use demc_infer::{Bundle, Picture, memory};
@@ -62,9 +62,13 @@ pub struct Arguments {
     #[arg(value_name = "IN.exr", required = true)]
     inputs: Vec<PathBuf>,
     /// Output file for one input, output directory for several. A directory is created if needed;
-    /// images that exist in it are skipped
+    /// images that exist in it are skipped, unless their input is newer
     #[arg(short, long, value_name = "OUT")]
     output: PathBuf,
+    /// Replace NaN, infinite and negative samples by the median of their neighbours. Without it, an
+    /// image with NaN or infinite samples is refused, and negative radiance counts as 0
+    #[arg(long)]
+    repair: bool,
     /// Replace existing outputs. Inputs are never replaced
     #[arg(long)]
     overwrite: bool,
@@ -158,7 +162,16 @@ impl Arguments {
         let say = |choice: &str| progress.line(format_args!("note: {name}: {choice}"));
         let layout = &layouts.of(&file, bundle, say)?;
         let mut file = file.keeping(layout, cache_bytes());
-        let frame = decode_input(&mut file, layout)?;
+        let frame = match self.repair {
+            false => decode_input(&mut file, layout)?,
+            true => {
+                let (frame, repaired) = decode_repaired(&mut file, layout)?;
+                if repaired > 0 {
+                    progress.line(format_args!("note: {name}: {repaired} samples repaired"));
+                }
+                frame
+            }
+        };
         for warning in bundle.warnings(&frame)? {
             progress.line(format_args!("warning: {name}: {warning}"));
         }

@@ -19,6 +19,14 @@ impl Job {
     pub fn preview(&self) -> PathBuf {
         self.output.with_extension("png")
     }
+
+    fn is_done(&self) -> bool {
+        let modified = |path: &Path| fs::metadata(path).and_then(|found| found.modified());
+        match (modified(&self.input), modified(&self.output)) {
+            (Ok(input), Ok(output)) => input <= output,
+            (_, output) => output.is_ok(),
+        }
+    }
 }
 
 /// All images of a command line.
@@ -93,7 +101,7 @@ impl Jobs {
     }
 
     /// Removes finished images from the list. Outputs are written atomically, so an existing output
-    /// is finished. With `previews`, its preview must exist, too.
+    /// is finished, unless its input is newer. With `previews`, its preview must exist, too.
     ///
     /// # Errors
     /// The only output exists, so there is nothing to do.
@@ -108,7 +116,7 @@ impl Jobs {
         }
         let before = self.list.len();
         self.list
-            .retain(|job| !job.output.exists() || previews && !job.preview().exists());
+            .retain(|job| !job.is_done() || previews && !job.preview().exists());
         self.skipped += before - self.list.len();
         Ok(())
     }
@@ -164,6 +172,28 @@ mod tests {
                 "{error}"
             );
         }
+        Ok(())
+    }
+
+    #[test]
+    fn an_output_older_than_its_input_is_made_again() -> std::io::Result<()> {
+        let dir = tempfile::tempdir()?;
+        let (input, out) = (dir.path().join("a.exr"), dir.path().join("out"));
+        fs::create_dir(&out)?;
+        fs::write(&input, "")?;
+        fs::write(out.join("a.exr"), "")?;
+        let left = || {
+            let mut jobs = jobs(vec![input.clone()], &out).expect("a job");
+            jobs.skip_done(false).expect("a directory");
+            jobs.list.len()
+        };
+        assert_eq!(left(), 0);
+        let later = std::time::SystemTime::now() + std::time::Duration::from_secs(60);
+        fs::File::options()
+            .write(true)
+            .open(&input)?
+            .set_modified(later)?;
+        assert_eq!(left(), 1);
         Ok(())
     }
 
