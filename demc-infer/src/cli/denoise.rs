@@ -10,7 +10,7 @@ use demc_data::exr::rewrite::{OutputChannels, WriteOptions, rewrite};
 use demc_data::exr::{Compression, ExrFile};
 use demc_data::frame::{decode_input, decode_repaired};
 use demc_infer::denoise::{DenoiseOptions, SeamError};
-use demc_infer::guard::EnergyBias;
+use demc_infer::guard::{EnergyBias, Warning};
 use demc_infer::{Bundle, Picture, memory};
 
 use super::Clamped;
@@ -20,6 +20,7 @@ use super::inputs::{Frames, Inputs};
 use super::jobs::{Job, Jobs};
 use super::layouts::{LayoutFlags, Layouts};
 use super::progress::Progress;
+use super::warnings::Warnings;
 
 /// Largest cache of an input's decoded blocks in bytes, kept until its output is written (ours:
 /// three times 19 half channels of 1920x1080). Blocks beyond it are decompressed twice.
@@ -119,6 +120,7 @@ impl Arguments {
         let jobs = jobs.list;
         let progress = Progress::new(jobs.len());
         let mut scales = SequenceScales::new(&inputs.sequences);
+        let warnings = Warnings::default();
         let mut clamped = Clamped::default();
         let mut failed = 0;
         for job in &jobs {
@@ -127,7 +129,7 @@ impl Arguments {
                 None => scales.of(&job.input, &bundle, &layouts),
                 given => given,
             };
-            match self.image(job, scale, &bundle, &layouts, &progress) {
+            match self.image(job, scale, &bundle, &layouts, &progress, &warnings) {
                 Ok(samples) => clamped.count(samples),
                 Err(error) if jobs.len() == 1 => return Err(error),
                 Err(error) => {
@@ -138,6 +140,9 @@ impl Arguments {
             progress.advance();
         }
         progress.finish();
+        for line in warnings.rest() {
+            eprintln!("warning: {line}");
+        }
         clamped.report();
         anyhow::ensure!(
             failed == 0,
@@ -156,6 +161,7 @@ impl Arguments {
         bundle: &Bundle,
         layouts: &Layouts,
         progress: &Progress,
+        warnings: &Warnings,
     ) -> anyhow::Result<usize> {
         let name = job.input.display();
         let file = ExrFile::open(&job.input)?;
@@ -172,9 +178,12 @@ impl Arguments {
                 frame
             }
         };
-        for warning in bundle.warnings(&frame)? {
-            progress.line(format_args!("warning: {name}: {warning}"));
-        }
+        let warn = |warning: &Warning| {
+            if let Some(line) = warnings.first(&job.input, warning) {
+                progress.line(format_args!("warning: {line}"));
+            }
+        };
+        bundle.warnings(&frame)?.iter().for_each(warn);
         let tiling = self.tiling.tiling();
         let options = DenoiseOptions {
             tiling: tiling.clone(),
@@ -203,9 +212,10 @@ impl Arguments {
             ));
         }
         let image = &denoised.color_hdr;
-        if let Some(warning) = EnergyBias::of(&frame, image).warning() {
-            progress.line(format_args!("warning: {name}: {warning}"));
-        }
+        EnergyBias::of(&frame, image)
+            .warning()
+            .iter()
+            .for_each(warn);
         // The preview comes first, because an existing output counts as finished.
         if self.png {
             let exposed: Vec<f32> = image.iter().map(|x| x * self.exposure.exp2()).collect();

@@ -18,6 +18,7 @@ mod layouts;
 mod progress;
 mod report;
 mod scenes;
+mod warnings;
 
 use std::fs;
 use std::path::Path;
