@@ -19,6 +19,7 @@ use demc_data::Frame;
 use demc_data::exr::ExrFile;
 use demc_data::exr::rewrite::{WriteOptions, rewrite};
 use demc_data::frame::{decode_input, read_input};
+use demc_infer::denoise::DenoiseOptions;
 use demc_infer::{Bundle, Ensemble, Tiling};
 
 #[global_allocator]
@@ -71,7 +72,7 @@ fn tiles(bundle: &Bundle, frame: &Frame) -> anyhow::Result<()> {
     ];
     let run = |tiling: &Tiling| {
         let options = DenoiseOptions {
-            tiling: tiling.clone(),
+            tiling: *tiling,
             ..DenoiseOptions::default()
         };
         let denoised = bundle.denoise_with(frame, &options, |_, _| ());

@@ -18,7 +18,7 @@ use crate::Patch;
 use crate::seed::{RandomStream, generator};
 
 /// Exposures are drawn between minus and plus this many stops (factors of 2); ours.
-pub(crate) const EXPOSURE_STOPS: f32 = 1.0;
+const EXPOSURE_STOPS: f32 = 1.0;
 
 /// The permutations of three, for colour channels and world axes.
 const ORDERS: [[usize; 3]; 6] = [

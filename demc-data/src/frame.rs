@@ -200,6 +200,9 @@ impl FramePlanes {
         let window = wanted.window(path, file)?;
         let names = wanted.names();
         let mut all = file.read(&names)?;
+        if let Some(first) = wanted.first_position() {
+            clear_misses(&mut all[first..first + 3]);
+        }
         let mut repaired = 0;
         if repair {
             let colors = wanted.color.len();
@@ -358,6 +361,13 @@ impl<'a> FrameChannels<'a> {
             .collect()
     }
 
+    /// Index of the first position channel in [`names`](Self::names).
+    fn first_position(&self) -> Option<usize> {
+        let position = self.features.get(3..TEXTURES)?;
+        let before = self.color.iter().chain(&self.features[..3]);
+        position[0].map(|_| before.flatten().count())
+    }
+
     fn window<R: Read + Seek>(&self, path: &Path, file: &ExrFile<R>) -> Result<Window, Error> {
         let names = self.names();
         let mut channels = names.iter().filter_map(|name| file.channel(name));
@@ -372,6 +382,19 @@ impl<'a> FrameChannels<'a> {
                 b_window: other.window.to_string(),
             }),
         }
+    }
+}
+
+/// Sets infinite positions to 0: LuxCore writes infinity where a camera ray hits nothing.
+fn clear_misses(position: &mut [Plane]) {
+    // Most files have none.
+    if position.iter().any(|plane| plane.non_finite().is_none()) {
+        return;
+    }
+    let planes: Vec<Vec<f32>> = position.iter().map(Plane::to_f32).collect();
+    let is_miss = |i: &usize| planes.iter().all(|plane| plane[*i].is_infinite());
+    for i in (0..planes[0].len()).filter(is_miss) {
+        position.iter_mut().for_each(|plane| plane.set(i, 0.0));
     }
 }
 

@@ -112,7 +112,8 @@ impl Plane {
         bad.len()
     }
 
-    fn set(&mut self, i: usize, value: f32) {
+    /// Replaces one sample.
+    pub(crate) fn set(&mut self, i: usize, value: f32) {
         match self {
             Plane::Half(samples) => samples[i] = f16::from_f32(value),
             Plane::Float(samples) => samples[i] = value,

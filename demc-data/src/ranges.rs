@@ -2,7 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::augment::EXPOSURE_STOPS;
 use crate::frame::{FEATURES, Frame, TEXTURES};
 use crate::moments::{ChannelMoments, hit_samples};
 
@@ -115,18 +114,6 @@ impl Ranges {
         }
     }
 
-    /// The ranges under random exposure ([`crate::Augment::exposure`]).
-    pub fn in_any_exposure(&self) -> Self {
-        let factor = EXPOSURE_STOPS.exp2();
-        Self {
-            exposure: Range {
-                low: self.exposure.low / factor,
-                high: self.exposure.high * factor,
-            },
-            ..self.clone()
-        }
-    }
-
     /// The ranges under random axis permutation and mirroring ([`crate::Augment::axes`]): each axis
     /// of normals and positions may be any other, in either direction.
     pub fn in_any_axes(&self) -> Self {
@@ -203,13 +190,6 @@ mod tests {
         assert!((ends(both.exposure)[1] - 1.0).abs() < 1e-6);
         assert_eq!(ends(both.mean[3]), [1.5, 3.5]);
         assert_eq!(ends(both.std[3]), [0.5, 0.5]);
-    }
-
-    #[test]
-    fn random_exposure_widens_the_range_by_a_stop() {
-        let ranges = Ranges::of(&[FrameSummary::of(&frame(0.25, 3.0))]);
-        let Range { low, high } = ranges.in_any_exposure().exposure;
-        assert!((low - 0.125).abs() < 1e-6 && (high - 0.5).abs() < 1e-6);
     }
 
     #[test]

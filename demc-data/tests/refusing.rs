@@ -209,3 +209,29 @@ fn nan_and_infinity_are_refused_with_their_place() {
         assert!(values.all(|x| x.is_finite()), "{channel}");
     }
 }
+
+/// LuxCore writes infinite positions where a camera ray hits nothing.
+#[test]
+fn three_infinite_coordinates_are_a_miss_and_fewer_are_refused() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let path = dir.path().join("a.exr");
+    let infinite = |axes: &[&str]| {
+        let mut channels = scene_channels(SIZE.0, SIZE.1);
+        for (name, samples) in &mut channels {
+            if axes.iter().any(|axis| *name == format!("position.{axis}")) {
+                match samples {
+                    FlatSamples::F16(samples) => samples[16] = f16::INFINITY,
+                    FlatSamples::F32(samples) => samples[16] = f32::INFINITY,
+                    FlatSamples::U32(_) => unreachable!("the layout has none"),
+                }
+            }
+        }
+        write(&path, SIZE, channels);
+    };
+    infinite(&["X", "Y", "Z"]);
+    let frame = read_frame(&path, &layout()).expect("a miss");
+    let position = [3, 4, 5].map(|channel| frame.features[channel * PIXELS + 16]);
+    assert_eq!(position, [0.0; 3]);
+    infinite(&["X", "Z"]);
+    assert!(refusal(&path).contains("channel position.X: inf"));
+}

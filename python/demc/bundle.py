@@ -26,6 +26,8 @@ MAX_ALBEDO = 1.0
 """Larger albedo counts as this."""
 MAX_INPUT_SCALE = 1e6
 """Largest factor on the colour, and the inverse of the smallest."""
+EXPOSURE_TOLERANCE = 2.0
+"""Exposures up to this factor outside the training scenes' range are not scaled."""
 FARTHEST = 5.0
 """Largest absolute position relative to the image."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
@@ -47,16 +49,20 @@ class Bundle:
     demodulate: float = 0.0  # epsilon of albedo demodulation; 0: off
 
     def input_scale(self, color_hdr: np.ndarray) -> float:
-        """The factor that brings colour [3, H, W] to the exposure of the brightest training scenes.
+        """The factor on colour [3, H, W] before the network, which its output is divided by.
 
-        1 for a black image and for a bundle without ranges. One factor serves a whole sequence and
-        all tiles of an image.
+        It is 1 within a stop of the training scenes' exposures, for a black image, and for a bundle
+        without ranges. Otherwise it brings the image to the middle of the training scenes'
+        exposures. One factor serves a whole sequence and all tiles of an image.
         """
         ranges = self.meta.get("ranges")
         exposure = exposure_of(color_hdr)
         if ranges is None or exposure == 0:
             return 1.0
-        scale = ranges["exposure"]["high"] / exposure
+        low, high = (ranges["exposure"][end] for end in ("low", "high"))
+        if low / EXPOSURE_TOLERANCE <= exposure <= high * EXPOSURE_TOLERANCE:
+            return 1.0
+        scale = (low * high) ** 0.5 / exposure
         return float(np.float32(np.clip(scale, 1 / MAX_INPUT_SCALE, MAX_INPUT_SCALE)))
 
     def map_positions(self, features: np.ndarray) -> np.ndarray:

@@ -24,10 +24,12 @@ def planes(*buffers):
     return np.pad(image, ((0, 0), (0, -height % 32), (0, -width % 32)), "edge")[None].astype("f4")
 
 
-# The network sees the exposure of the brightest training scenes.
+# An unusual exposure is scaled to the middle of the training scenes' exposures.
 red, green, blue = (channels[name].pixels.astype("f4").clip(0) for name in layout["color"])
 luminance = 0.2126 * red + 0.7152 * green + 0.0722 * blue
-scale = np.float32(meta["ranges"]["exposure"]["high"] / np.mean(luminance ** (1 / 2.2)) ** 2.2)
+exposure = np.mean(luminance ** (1 / 2.2)) ** 2.2
+low, high = (meta["ranges"]["exposure"][end] for end in ("low", "high"))
+scale = np.float32(1 if exposure == 0 or low / 2 <= exposure <= high * 2 else (low * high) ** 0.5 / exposure)
 features = planes("normal", "position", "texture1", "texture2")
 [output] = session.run(["output"], {"color": planes("color") * scale, "features": features})
 output /= scale

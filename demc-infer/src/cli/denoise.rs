@@ -186,7 +186,7 @@ impl Arguments {
         bundle.warnings(&frame)?.iter().for_each(warn);
         let tiling = self.tiling.tiling();
         let options = DenoiseOptions {
-            tiling: tiling.clone(),
+            tiling,
             ensemble: self.ensemble.passes,
             input_scale,
         };

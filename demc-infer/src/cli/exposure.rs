@@ -16,8 +16,8 @@ use super::layouts::Layouts;
 /// `--input-scale`.
 #[derive(Args)]
 pub struct InputScaleFlag {
-    /// Factor on the colour before the network; the result is divided by it. `auto` brings each
-    /// image, or the median frame of a sequence, to the exposure of the training scenes
+    /// Factor on the colour before the network; the result is divided by it. `auto`: 1, unless the
+    /// image or the median frame of its sequence is more than a stop outside the training scenes
     #[arg(
         long = "input-scale",
         value_name = "auto|FACTOR",

@@ -19,7 +19,7 @@ use crate::padding::Padding;
 use crate::tiles::{Tiles, Tiling};
 
 pub use crate::error::DenoiseError;
-pub use exposure::{MAX_INPUT_SCALE, input_scale};
+pub use exposure::MAX_INPUT_SCALE;
 pub use seams::SeamError;
 
 /// How a frame is denoised.

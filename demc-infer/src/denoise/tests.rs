@@ -23,7 +23,7 @@ fn denoise(
     ensemble: Ensemble,
 ) -> Result<Denoised, DenoiseError> {
     let options = DenoiseOptions {
-        tiling: tiling.clone(),
+        tiling: *tiling,
         ensemble,
         input_scale: Some(1.0),
     };
@@ -261,9 +261,10 @@ fn an_ensemble_of_tiles_is_that_of_the_whole_image() {
     assert!(difference <= 2e-6, "{difference}");
 }
 
-/// Colour times a factor gives the image times that factor, up to float32 rounding.
+/// Outside the usual range, colour times a factor gives the image times that factor, up to float32
+/// rounding. The training range is the exposure of this image alone.
 #[test]
-fn the_exposure_of_an_image_does_not_matter() {
+fn the_exposure_of_an_unusual_image_does_not_matter() {
     let mut bundle = bundle(Variant::Demc);
     let frame = frame(70, 40);
     let ranges = demc_data::Ranges::of(&[demc_data::FrameSummary::of(&frame)]);
@@ -291,6 +292,9 @@ fn a_black_image_stays_finite_and_has_scale_one() {
     let mut frame = frame(40, 40);
     let ranges = demc_data::Ranges::of(&[demc_data::FrameSummary::of(&frame)]);
     bundle.meta.ranges = Some(ranges);
+    let exposure = demc_data::ranges::exposure(&frame.color);
+    assert_eq!(bundle.input_scale(exposure), 1.0);
+    assert_eq!(bundle.input_scale(1.9 * exposure), 1.0);
     assert_eq!(bundle.input_scale(0.0), 1.0);
     assert_eq!(bundle.input_scale(1e-300), MAX_INPUT_SCALE);
     frame.color.fill(0.0);

@@ -58,8 +58,9 @@ pub const META: &str = "demc";
 pub const FEATURE_ORDER: &str = "demc.features";
 
 const DOCUMENTATION: &str = "DEMC, a denoiser for Monte Carlo renderings (Yang et al. 2019). \
-    color [batch, 3, height, width] is noisy radiance in linear HDR, times a factor s that brings \
-    mean(luminance^(1/2.2))^2.2 to ranges.exposure.high of the metadata; divide the output by s. \
+    color [batch, 3, height, width] is noisy radiance in linear HDR, times a factor s; divide the output by s. \
+    s is 1 if e = mean(luminance^(1/2.2))^2.2 is between low / 2 and 2 * high of ranges.exposure in the metadata, \
+    otherwise sqrt(low * high) / e. \
     features [batch, 12, height, width] are shading normal xyz, world position xyz, and albedo RGB at the \
     first and at the second intersection, raw, in the renderer's units. If normalizer.position of the \
     metadata is `image`, positions are clamp((p - median) / median distance from it, -5, 5), and 0 without a hit. \

@@ -64,21 +64,16 @@ impl RunData {
             // Now, not after days of training.
             clamped += read_frame(&scene.path, &layout)?.clamped as u64;
         }
-        let mut ranges = statistics.ranges;
-        let augment = config.data.augment;
-        if augment.axes {
-            ranges = ranges.in_any_axes();
-        }
-        if augment.exposure {
-            ranges = ranges.in_any_exposure();
-        }
         Ok(RunData {
             layout,
             train,
             validation,
             test,
             normalizer: statistics.normalizer,
-            ranges,
+            ranges: match config.data.augment.axes {
+                true => statistics.ranges.in_any_axes(),
+                false => statistics.ranges,
+            },
             clamped,
         })
     }

@@ -9,7 +9,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use burn::tensor::Device;
-use demc_data::{ChannelLayout, FeatureStats, Normalizer};
+use demc_data::{ChannelLayout, FeatureStats, Normalizer, PositionSpace};
 use demc_infer::{Bundle, BundleMeta};
 use demc_model::config::LEVEL_WIDTHS;
 use demc_model::{ModelConfig, Reading, Variant, Weight, Weights};
@@ -115,6 +115,7 @@ pub fn random_bundle(
             Reading::Paper => None,
             Reading::Released => Some(1.0),
         },
+        position: PositionSpace::Scene,
         features: FeatureStats {
             mean: std::array::from_fn(|channel| 0.3 * channel as f32 - 1.0),
             std: std::array::from_fn(|channel| 0.4 + 0.5 * channel as f32),
