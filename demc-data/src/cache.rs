@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::dataset::size_mismatch;
 use crate::frame::{FramePlanes, Presence};
-use crate::position::PositionSpace;
+use crate::position::{PositionSpace, map_planes};
 use crate::{ChannelLayout, Error, Scene};
 
 /// The scenes of a training run, decoded on demand: colour, features and reference, no mask. The
@@ -94,7 +94,7 @@ impl SceneCache {
         if let Some(error) = size_mismatch(scene, planes.width, planes.height) {
             return Err(error);
         }
-        planes.map_positions(self.position);
+        map_planes(&mut planes.features, self.position);
         let planes = Arc::new(planes);
         lock(&self.kept).keep(index, &planes, self.budget);
         Ok(planes)

@@ -11,7 +11,6 @@ use crate::exr::ExrFile;
 use crate::layout::{ChannelLayout, Missing, Triple};
 use crate::parallel;
 use crate::plane::Plane;
-use crate::position::{PositionMap, PositionSpace};
 
 /// Number of feature channels: normal xyz, position xyz, texture RGB at the first and at the second
 /// vertex (Sec. 3.1).
@@ -250,20 +249,6 @@ impl FramePlanes {
             .chain(planes.reference.iter_mut().flatten());
         planes.clamped = radiance.map(Plane::clamp_negative).sum();
         Ok((planes, repaired))
-    }
-
-    /// Converts the positions to `space` ([`PositionMap`]).
-    pub fn map_positions(&mut self, space: PositionSpace) {
-        if space.is_scene() {
-            return;
-        }
-        let mut features = planar(&self.features);
-        PositionMap::of(&features).apply(&mut features);
-        let pixels = self.width * self.height;
-        let positions = features.chunks_exact(pixels).skip(3).take(3);
-        for (plane, mapped) in self.features[3..TEXTURES].iter_mut().zip(positions) {
-            *plane = Plane::Float(mapped.to_vec());
-        }
     }
 
     /// Memory of all samples in bytes.

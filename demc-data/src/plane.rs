@@ -77,9 +77,10 @@ impl Plane {
         }
     }
 
-    /// Replaces NaN and infinite samples, and with `negative` those below 0, by the median of the
-    /// other samples around them: in 3x3 pixels, or in the smallest larger square up to 17x17 that
-    /// has any, or in the whole plane. Returns their number. Without any sound sample they become 0.
+    /// Replaces NaN and infinite samples, and with `negative` those below 0. Returns their number.
+    ///
+    /// A sample becomes the median of the sound samples in 3x3 pixels around it. If there are none,
+    /// the square grows up to 17x17 pixels; then the whole plane counts, and 0 is the last resort.
     ///
     /// `size` is height and width.
     pub fn repair(&mut self, (height, width): (usize, usize), negative: bool) -> usize {

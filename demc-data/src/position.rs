@@ -4,6 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::frame::FEATURES;
+use crate::plane::Plane;
 
 /// First plane of the positions.
 const FIRST: usize = 3;
@@ -76,6 +77,20 @@ impl PositionMap {
                 };
             }
         }
+    }
+}
+
+/// Converts the positions of 12 feature planes to `space`.
+pub(crate) fn map_planes(features: &mut [Plane], space: PositionSpace) {
+    if space.is_scene() {
+        return;
+    }
+    let mut planar: Vec<f32> = features.iter().flat_map(Plane::to_f32).collect();
+    PositionMap::of(&planar).apply(&mut planar);
+    let pixels = planar.len() / FEATURES;
+    let mapped = planar.chunks_exact(pixels.max(1)).skip(FIRST);
+    for (plane, mapped) in features[FIRST..FIRST + 3].iter_mut().zip(mapped) {
+        *plane = Plane::Float(mapped.to_vec());
     }
 }
 

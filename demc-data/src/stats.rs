@@ -7,6 +7,7 @@ use crate::frame::{FEATURES, FramePlanes, Presence, TEXTURES};
 use crate::moments::{ChannelMoments, hit_samples};
 use crate::parallel;
 use crate::plane::Plane;
+use crate::position::map_planes;
 use crate::ranges::{FrameSummary, Ranges};
 use crate::transform::STD_FLOOR;
 use crate::{ChannelLayout, DataConfig, Error, FeatureStats, Normalizer, Scene};
@@ -118,7 +119,7 @@ impl SceneSums {
         if let Some(error) = size_mismatch(scene, planes.width, planes.height) {
             return Err(error);
         }
-        planes.map_positions(config.position);
+        map_planes(&mut planes.features, config.position);
         let albedo_epsilon = config.albedo_demodulation_epsilon;
         let pixels = planes.width * planes.height;
         let mask = planes.mask.as_ref().map(Plane::to_f32);

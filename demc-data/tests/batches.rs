@@ -11,7 +11,7 @@ use demc_data::cache::SceneCache;
 use demc_data::frame::TEXTURES;
 use demc_data::{
     Augment, Batch, BatchLoader, Border, DataConfig, Error, FEATURES, Normalizer, PatchSource,
-    Scene, read_frame,
+    Scene, Statistics, read_frame,
 };
 use support::batches::{small, source, train_scenes};
 use support::{identity, layout, scene_channels, write};
@@ -278,4 +278,41 @@ fn scenes_smaller_than_a_patch_and_layouts_without_reference_are_refused() {
         .err()
         .expect("no reference");
     assert!(error.to_string().contains("names no reference"), "{error}");
+}
+
+/// With `position = "image"`, batches and statistics have the image's own origin and unit.
+#[test]
+fn positions_relative_to_the_image_are_mapped_before_statistics_and_batches() {
+    let config = |position| DataConfig {
+        position,
+        ..small()
+    };
+    let position = |batch: &Batch| -> Vec<f32> {
+        let pixels = batch.patch_size * batch.patch_size;
+        let patches = batch.features_z.chunks_exact(FEATURES * pixels);
+        let positions = patches.map(|patch| patch[3 * pixels..6 * pixels].to_vec());
+        positions.flatten().collect()
+    };
+    let [scene, image] = [PositionSpace::Scene, PositionSpace::Image].map(|space| {
+        source(&config(space))
+            .batch(0)
+            .expect("the sample is sound")
+    });
+    let mapped = position(&image);
+    assert_ne!(position(&scene), mapped);
+    assert!(mapped.iter().all(|x| (-5.0..=5.0).contains(x)));
+    assert_eq!(scene.color_gamma, image.color_gamma);
+
+    let spread = |space| {
+        let scenes = train_scenes();
+        let measured = Statistics::measure(&scenes, &layout(), &config(space), 0.001);
+        let measured = measured.expect("the sample is sound").normalizer;
+        assert_eq!(measured.position, space);
+        measured.features.std[3..6]
+            .iter()
+            .copied()
+            .fold(0.0, f32::max)
+    };
+    // The scenes differ in size; their images do not.
+    assert!(spread(PositionSpace::Image) < 2.0 && spread(PositionSpace::Scene) > 2.0);
 }

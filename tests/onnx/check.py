@@ -13,7 +13,7 @@ import onnx
 import onnxruntime
 from onnx.tools.update_model_dims import update_inputs_outputs_dims
 
-OPERATORS = {"Relu", "Pow", "Sub", "Div", "Conv", "ConvTranspose", "MaxPool", "Concat", "Cast", "Mul", "Slice", "Add"}
+OPERATORS = {"Relu", "Pow", "Sub", "Div", "Conv", "ConvTranspose", "MaxPool", "Min", "Concat", "Cast", "Mul", "Slice", "Add"}
 SHAPES = {"color": ["batch", 3, "height", "width"], "features": ["batch", 12, "height", "width"]}
 OUTPUT = ["batch", 3, "height", "width"]
 

@@ -37,10 +37,9 @@ fn cache_bytes() -> usize {
 /// Inputs are files, directories, glob patterns, or frame sequences. Failed inputs are reported and
 /// skipped, and the exit code is 1. Rerun the command to resume a partly finished directory.
 ///
-/// The channels of each input are found by their names: as in the model's training data, or as
-/// Mitsuba, pbrt, Blender Cycles or FBKSD write them. --layout chooses other names. An image that
-/// differs from the training data causes a warning with the likely cause. Negative radiance counts
-/// as 0.
+/// Channels have the names of the model's training data, or those that Mitsuba, pbrt, Blender
+/// Cycles or FBKSD write. --layout chooses other names. An image that differs from the training
+/// data causes a warning with the likely cause. Negative radiance counts as 0.
 ///
 /// The output is the input with denoised colour. Parts, windows, attributes, compression and all
 /// other channels stay.

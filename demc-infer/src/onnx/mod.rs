@@ -8,9 +8,9 @@
 //!
 //! The batch can have any size. Height and width must be multiples of 32; with another size, a
 //! runtime fails at the first skip fusion. The graph contains gamma, Z-score and their inverses.
-//! Two conversions need the whole image, and a batch may hold tiles, so the caller does them:
-//! the colour is multiplied by [`Bundle::input_scale`] and the output divided by it, and positions
-//! are mapped.
+//! Two conversions need the whole image, and a batch may hold tiles, so the caller does them. The
+//! colour is multiplied by [`Bundle::input_scale`] and the output divided by it. Positions are
+//! mapped.
 //! Batch normalisation is folded into the convolutions. All variants have both inputs; color-only
 //! ignores the second. Inputs, outputs and all computations are float32; [`Precision::F16`] only
 //! affects the stored weights of the convolutions.
