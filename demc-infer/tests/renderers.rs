@@ -32,17 +32,20 @@ fn open(path: &Path) -> ExrFile {
     ExrFile::open(path).expect("an EXR file")
 }
 
-/// The channels R, G, B of the colour, whatever comes before the last letter.
-fn color(path: &Path) -> Vec<f32> {
-    let mut file = open(path);
-    let names = ["R", "G", "B"].map(|channel| {
+/// The names of red, green and blue of the colour.
+fn color_names(file: &ExrFile) -> [String; 3] {
+    ["R", "G", "B"].map(|channel| {
         let combined = format!("ViewLayer.Combined.{channel}");
         match file.channel(&combined) {
             Some(_) => combined,
             None => channel.to_owned(),
         }
-    });
-    let planes = file.read(&names.each_ref().map(String::as_str));
+    })
+}
+
+fn color(path: &Path) -> Vec<f32> {
+    let mut file = open(path);
+    let planes = file.read(&color_names(&file).each_ref().map(String::as_str));
     let planes = planes.expect("colour");
     planes.iter().flat_map(Plane::to_f32).collect()
 }
@@ -66,15 +69,27 @@ fn stock_files_are_denoised_without_an_option_and_keep_their_other_channels() {
         };
         assert_eq!(names(&before), names(&after), "{name}");
         for channel in names(&before) {
-            let is_color = |suffix| channel == suffix || channel.ends_with("Combined.R");
-            let is_color = ["R", "G", "B"].into_iter().any(is_color)
-                || channel.ends_with("Combined.G")
-                || channel.ends_with("Combined.B");
+            let is_color = color_names(&before).contains(&channel);
             let planes =
                 [&mut before, &mut after].map(|file| file.read(&[&channel]).expect("read"));
             assert_eq!(planes[0] == planes[1], !is_color, "{name}: {channel}");
         }
     }
+}
+
+/// The choice of the layout is printed once for a sequence, although its exposure is read first.
+#[test]
+fn the_layout_of_a_sequence_is_printed_once() {
+    let directory = tempfile::tempdir().expect("a directory");
+    for frame in ["0001", "0002", "0003"] {
+        let copy = directory.path().join(format!("shot.{frame}.exr"));
+        std::fs::copy(path("cycles-5.0.exr"), copy).expect("copied");
+    }
+    let sequence = directory.path().join("shot.####.exr");
+    let outputs = directory.path().join("out");
+    let outcome = demc_infer(arguments!["denoise", sequence, "-o", outputs]).success();
+    let notes = outcome.stderr.matches("layout cycles").count();
+    assert_eq!(notes, 1, "{}", outcome.stderr);
 }
 
 fn bundle() -> Bundle {

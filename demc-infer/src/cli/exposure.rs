@@ -96,7 +96,7 @@ impl<'a> SequenceScales<'a> {
 /// The exposure of an image, from its colour alone.
 fn exposure_of(path: &Path, bundle: &Bundle, layouts: &Layouts) -> Result<f64, demc_data::Error> {
     let mut file = ExrFile::open(path)?;
-    let layout = layouts.of(&file, bundle, |_| ())?;
+    let (layout, _) = layouts.choose(&file, bundle)?;
     let names = layout.color.each_ref().map(String::as_str);
     file.require(&names)?;
     let planes = file.read(&names)?;

@@ -56,33 +56,46 @@ impl Layouts<'_> {
     /// passed to `say`, once for all files.
     ///
     /// # Errors
-    /// As [`detect`] and [`ChannelLayout::in_file`].
+    /// As [`choose`](Self::choose).
     pub fn of(
         &self,
         file: &ExrFile,
         bundle: &Bundle,
         say: impl FnOnce(&str),
     ) -> Result<ChannelLayout, Error> {
+        let (layout, choice) = self.choose(file, bundle)?;
+        if let Some(choice) = choice.filter(|choice| !self.said.borrow().contains(choice)) {
+            say(&choice);
+            self.said.borrow_mut().push(choice);
+        }
+        Ok(layout)
+    }
+
+    /// The layout of `file`, and a description of a choice among the presets.
+    ///
+    /// # Errors
+    /// As [`detect`] and [`ChannelLayout::in_file`].
+    pub fn choose(
+        &self,
+        file: &ExrFile,
+        bundle: &Bundle,
+    ) -> Result<(ChannelLayout, Option<String>), Error> {
         let layer = self.flags.layer.as_deref();
         let missing = bundle.missing();
         if let Some(given) = &self.given {
             let mut layout = given.in_file(file, layer)?.into_owned();
             layout.missing = layout.missing.or(missing);
-            return Ok(layout);
+            return Ok((layout, None));
         }
         let own = &bundle.meta.layout;
         if let Ok(own) = own.in_file(file, layer)
             && own.fits(file)
         {
-            return Ok(own.into_owned());
+            return Ok((own.into_owned(), None));
         }
         let found = detect(file, missing, layer)?;
         let choice = describe(&found);
-        if !self.said.borrow().contains(&choice) {
-            say(&choice);
-            self.said.borrow_mut().push(choice);
-        }
-        Ok(found.layout)
+        Ok((found.layout, Some(choice)))
     }
 
     /// The layout of a data set: that of its first file.
