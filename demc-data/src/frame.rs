@@ -10,11 +10,14 @@ use crate::channel::Window;
 use crate::exr::ExrFile;
 use crate::layout::{ChannelLayout, Missing, Triple};
 use crate::parallel;
-use crate::plane::Plane;
+use crate::plane::{Plane, clear_infinite};
 
 /// Number of feature channels: normal xyz, position xyz, texture RGB at the first and at the second
 /// vertex (Sec. 3.1).
 pub const FEATURES: usize = 12;
+
+/// Index of the first position channel; normals come before it.
+pub const POSITIONS: usize = 3;
 
 /// Index of the first texture channel; normals and positions come before it.
 pub const TEXTURES: usize = 6;
@@ -200,7 +203,8 @@ impl FramePlanes {
         let names = wanted.names();
         let mut all = file.read(&names)?;
         if let Some(first) = wanted.first_position() {
-            clear_misses(&mut all[first..first + 3]);
+            // LuxCore's positions where a camera ray hits nothing.
+            clear_infinite(&mut all[first..first + 3]);
         }
         let mut repaired = 0;
         if repair {
@@ -272,9 +276,20 @@ pub fn check_header(
     layout: &ChannelLayout,
     reference: Presence,
 ) -> Result<Window, Error> {
-    let file = ExrFile::open(path)?;
-    let layout = &*layout.in_file(&file, None)?;
-    FrameChannels::new(&file, layout, reference, Presence::IfPresent)?.window(path, &file)
+    check_open_header(&ExrFile::open(path)?, layout, reference)
+}
+
+/// As [`check_header`], for an open file.
+///
+/// # Errors
+/// As [`check_header`].
+pub fn check_open_header<R: Read + Seek>(
+    file: &ExrFile<R>,
+    layout: &ChannelLayout,
+    reference: Presence,
+) -> Result<Window, Error> {
+    let layout = &*layout.in_file(file, None)?;
+    FrameChannels::new(file, layout, reference, Presence::IfPresent)?.window(file.path(), file)
 }
 
 /// The channels of a frame; `None` stands for zeros.
@@ -348,8 +363,8 @@ impl<'a> FrameChannels<'a> {
 
     /// Index of the first position channel in [`names`](Self::names).
     fn first_position(&self) -> Option<usize> {
-        let position = self.features.get(3..TEXTURES)?;
-        let before = self.color.iter().chain(&self.features[..3]);
+        let position = self.features.get(POSITIONS..TEXTURES)?;
+        let before = self.color.iter().chain(&self.features[..POSITIONS]);
         position[0].map(|_| before.flatten().count())
     }
 
@@ -367,19 +382,6 @@ impl<'a> FrameChannels<'a> {
                 b_window: other.window.to_string(),
             }),
         }
-    }
-}
-
-/// Sets infinite positions to 0: LuxCore writes infinity where a camera ray hits nothing.
-fn clear_misses(position: &mut [Plane]) {
-    // Most files have none.
-    if position.iter().any(|plane| plane.non_finite().is_none()) {
-        return;
-    }
-    let planes: Vec<Vec<f32>> = position.iter().map(Plane::to_f32).collect();
-    let is_miss = |i: &usize| planes.iter().all(|plane| plane[*i].is_infinite());
-    for i in (0..planes[0].len()).filter(is_miss) {
-        position.iter_mut().for_each(|plane| plane.set(i, 0.0));
     }
 }
 

@@ -1,4 +1,4 @@
-//! Mean and standard deviation of a channel's samples, in double precision.
+//! Mean and standard deviation of a channel's samples, in double precision; medians.
 
 /// Number of channels that exclude misses: normal xyz and position xyz, which are undefined without
 /// a hit.
@@ -51,6 +51,16 @@ impl ChannelMoments {
 
     pub(crate) fn std(&self) -> f64 {
         (self.squares / self.count.max(1.0)).sqrt()
+    }
+}
+
+/// The upper median; `None` of nothing.
+pub(crate) fn median(values: impl Iterator<Item = f32>) -> Option<f32> {
+    let mut values: Vec<f32> = values.collect();
+    let middle = values.len() / 2;
+    match values.is_empty() {
+        true => None,
+        false => Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1),
     }
 }
 

@@ -4,6 +4,8 @@
 use half::f16;
 use half::slice::HalfFloatSliceExt;
 
+use crate::moments::median;
+
 /// Largest distance of a neighbour that repairs a sample, in pixels.
 const MAX_RADIUS: usize = 8;
 
@@ -89,10 +91,6 @@ impl Plane {
         let bad: Vec<usize> = (0..samples.len())
             .filter(|i| !is_sound(&samples[*i]))
             .collect();
-        let median = |mut sound: Vec<f32>| {
-            sound.sort_by(f32::total_cmp);
-            sound.get(sound.len() / 2).copied()
-        };
         let mut of_plane = None;
         for &i in &bad {
             let (y, x) = (i / width, i % width);
@@ -100,12 +98,12 @@ impl Plane {
                 let rows = y.saturating_sub(radius)..(y + radius + 1).min(height);
                 let columns = x.saturating_sub(radius)..(x + radius + 1).min(width);
                 let rows = rows.map(|y| &samples[y * width..][columns.clone()]);
-                median(rows.flatten().copied().filter(is_sound).collect())
+                median(rows.flatten().copied().filter(is_sound))
             });
             let value = near.unwrap_or_else(|| {
                 *of_plane.get_or_insert_with(|| {
                     let sound = samples.iter().copied().filter(is_sound);
-                    median(sound.collect()).unwrap_or(0.0)
+                    median(sound).unwrap_or(0.0)
                 })
             });
             self.set(i, value);
@@ -113,8 +111,7 @@ impl Plane {
         bad.len()
     }
 
-    /// Replaces one sample.
-    pub(crate) fn set(&mut self, i: usize, value: f32) {
+    fn set(&mut self, i: usize, value: f32) {
         match self {
             Plane::Half(samples) => samples[i] = f16::from_f32(value),
             Plane::Float(samples) => samples[i] = value,
@@ -129,6 +126,19 @@ impl Plane {
             Plane::Float(samples) => clamp(samples, 0.0),
             Plane::Uint(_) => 0,
         }
+    }
+}
+
+/// Sets samples to 0 that are infinite in all planes.
+pub(crate) fn clear_infinite(planes: &mut [Plane]) {
+    // Most files have none.
+    if planes.iter().any(|plane| plane.non_finite().is_none()) {
+        return;
+    }
+    let samples: Vec<Vec<f32>> = planes.iter().map(Plane::to_f32).collect();
+    let infinite = |i: &usize| samples.iter().all(|plane| plane[*i].is_infinite());
+    for i in (0..samples[0].len()).filter(infinite) {
+        planes.iter_mut().for_each(|plane| plane.set(i, 0.0));
     }
 }
 

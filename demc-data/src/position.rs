@@ -3,11 +3,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::frame::FEATURES;
+use crate::frame::{FEATURES, POSITIONS, TEXTURES};
+use crate::moments::median;
 use crate::plane::Plane;
 
-/// First plane of the positions.
-const FIRST: usize = 3;
 /// Largest absolute value after the mapping, in extents: farther surfaces are at this distance.
 const FARTHEST: f32 = 5.0;
 
@@ -45,14 +44,15 @@ impl PositionMap {
     /// # Shapes
     /// `features`, as rendered, is `[12, N]`.
     pub fn of(features: &[f32]) -> Self {
-        let planes = Planes::of(features);
-        let hits: Vec<usize> = (0..planes.pixels()).filter(|i| planes.is_hit(*i)).collect();
-        let center = [0, 1, 2].map(|axis| median(hits.iter().map(|i| planes.position(*i)[axis])));
-        let distances = hits.iter().map(|i| distance(planes.position(*i), center));
-        let distances: Vec<f32> = distances.collect();
+        let pixels = features.len() / FEATURES;
+        let position = |i: usize| [0, 1, 2].map(|axis| features[(POSITIONS + axis) * pixels + i]);
+        let hits = (0..pixels).filter(|i| is_hit(features, pixels, *i));
+        let hits: Vec<[f32; 3]> = hits.map(position).collect();
+        let center = [0, 1, 2].map(|axis| median(hits.iter().map(|hit| hit[axis])).unwrap_or(0.0));
+        let distances: Vec<f32> = hits.iter().map(|hit| distance(*hit, center)).collect();
         let extent = match median(distances.iter().copied()) {
-            0.0 => distances.iter().sum::<f32>() / distances.len().max(1) as f32,
-            median => median,
+            None | Some(0.0) => distances.iter().sum::<f32>() / distances.len().max(1) as f32,
+            Some(median) => median,
         };
         Self { center, extent }
     }
@@ -63,16 +63,12 @@ impl PositionMap {
     /// `features`, as rendered, is `[12, N]`.
     pub fn apply(&self, features: &mut [f32]) {
         let pixels = features.len() / FEATURES;
-        let (normals, rest) = features.split_at_mut(FIRST * pixels);
-        let positions = &mut rest[..3 * pixels];
         for i in 0..pixels {
-            let at = [i, i + pixels, i + 2 * pixels];
-            let is_hit = at
-                .iter()
-                .any(|i| normals[*i] != 0.0 || positions[*i] != 0.0);
-            for (i, center) in at.into_iter().zip(self.center) {
-                positions[i] = match is_hit && self.extent > 0.0 {
-                    true => ((positions[i] - center) / self.extent).clamp(-FARTHEST, FARTHEST),
+            let hit = self.extent > 0.0 && is_hit(features, pixels, i);
+            for (axis, center) in self.center.into_iter().enumerate() {
+                let value = &mut features[(POSITIONS + axis) * pixels + i];
+                *value = match hit {
+                    true => ((*value - center) / self.extent).clamp(-FARTHEST, FARTHEST),
                     false => 0.0,
                 };
             }
@@ -88,46 +84,20 @@ pub(crate) fn map_planes(features: &mut [Plane], space: PositionSpace) {
     let mut planar: Vec<f32> = features.iter().flat_map(Plane::to_f32).collect();
     PositionMap::of(&planar).apply(&mut planar);
     let pixels = planar.len() / FEATURES;
-    let mapped = planar.chunks_exact(pixels.max(1)).skip(FIRST);
-    for (plane, mapped) in features[FIRST..FIRST + 3].iter_mut().zip(mapped) {
+    let mapped = planar.chunks_exact(pixels.max(1)).skip(POSITIONS);
+    for (plane, mapped) in features[POSITIONS..TEXTURES].iter_mut().zip(mapped) {
         *plane = Plane::Float(mapped.to_vec());
     }
 }
 
-/// Normals and positions of `[12, N]`.
-struct Planes<'a>(&'a [f32]);
-
-impl<'a> Planes<'a> {
-    fn of(features: &'a [f32]) -> Self {
-        Self(&features[..features.len() / FEATURES * (FIRST + 3)])
-    }
-
-    fn pixels(&self) -> usize {
-        self.0.len() / (FIRST + 3)
-    }
-
-    fn position(&self, i: usize) -> [f32; 3] {
-        [3, 4, 5].map(|plane| self.0[plane * self.pixels() + i])
-    }
-
-    fn is_hit(&self, i: usize) -> bool {
-        let mut planes = self.0.chunks_exact(self.pixels());
-        planes.any(|plane| plane[i] != 0.0)
-    }
+/// Whether a ray of pixel `i` of `[12, pixels]` hit a surface: normal or position is not 0.
+fn is_hit(features: &[f32], pixels: usize, i: usize) -> bool {
+    (0..TEXTURES).any(|plane| features[plane * pixels + i] != 0.0)
 }
 
 fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
     let squares = a.iter().zip(b).map(|(a, b)| (a - b) * (a - b));
     squares.sum::<f32>().sqrt()
-}
-
-/// The upper median; 0 of nothing.
-fn median(values: impl Iterator<Item = f32>) -> f32 {
-    let mut values: Vec<f32> = values.collect();
-    match values.len() {
-        0 => 0.0,
-        length => *values.select_nth_unstable_by(length / 2, f32::total_cmp).1,
-    }
 }
 
 #[cfg(test)]
@@ -141,16 +111,16 @@ mod tests {
         let mut features = vec![0.0; FEATURES * PIXELS];
         for (i, x) in [-2.0, -1.0, 1.0, 2.0].into_iter().enumerate() {
             features[i] = 1.0;
-            features[FIRST * PIXELS + i] = map(x);
-            features[(FIRST + 1) * PIXELS + i] = map(0.0);
-            features[(FIRST + 2) * PIXELS + i] = map(0.0);
+            features[POSITIONS * PIXELS + i] = map(x);
+            features[(POSITIONS + 1) * PIXELS + i] = map(0.0);
+            features[(POSITIONS + 2) * PIXELS + i] = map(0.0);
         }
         features
     }
 
     fn x(mut features: Vec<f32>) -> Vec<f32> {
         PositionMap::of(&features).apply(&mut features);
-        features[FIRST * PIXELS..(FIRST + 1) * PIXELS].to_vec()
+        features[POSITIONS * PIXELS..(POSITIONS + 1) * PIXELS].to_vec()
     }
 
     #[test]
@@ -165,7 +135,7 @@ mod tests {
     #[test]
     fn far_surfaces_are_at_the_limit() {
         let mut far = features(|x| x);
-        far[FIRST * PIXELS] = 1e9;
+        far[POSITIONS * PIXELS] = 1e9;
         assert_eq!(x(far)[0], FARTHEST);
     }
 
@@ -179,7 +149,7 @@ mod tests {
     #[test]
     fn when_most_surfaces_are_at_one_point_the_mean_distance_counts() {
         let mut features = features(|_| 3.0);
-        features[FIRST * PIXELS] = 7.0;
+        features[POSITIONS * PIXELS] = 7.0;
         assert_eq!(x(features), [4.0, 0.0, 0.0, 0.0, 0.0]);
     }
 }

@@ -6,6 +6,7 @@ for everything that is chosen by a measurement.
 
 from __future__ import annotations
 
+import argparse
 import random
 from dataclasses import dataclass, field
 
@@ -128,3 +129,16 @@ def scene(number: int) -> Scene:
     result.meshes.append(lamp((0.3, -0.2, 2.4), size, [power / size**2 * c for c in (1.0, 0.9, 0.75)]))
     clutter(rng, result, 14, 1.1, 0.0)
     return result
+
+
+def run(description, render):
+    """The command line of a renderer's script: calls `render(scene, out, size, spp, seed, plain)`."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=int)
+    parser.add_argument("out")
+    parser.add_argument("--spp", type=int, default=4)
+    parser.add_argument("--size", default="320x200", type=lambda text: tuple(int(side) for side in text.split("x")))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--plain", action="store_true")
+    arguments = parser.parse_args()
+    render(scene(arguments.scene), arguments.out, arguments.size, arguments.spp, arguments.seed, arguments.plain)

@@ -6,7 +6,6 @@ LuxCore writes each output as a file of its own with channels R, G, B: the colou
 OUT.albedo.exr, OUT.normal.exr and OUT.position.exr. `--plain` writes the colour alone: a reference.
 """
 
-import argparse
 import os
 import sys
 import time
@@ -97,12 +96,4 @@ def render(source, out, size, spp, seed, plain):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=int)
-    parser.add_argument("out")
-    parser.add_argument("--spp", type=int, default=4)
-    parser.add_argument("--size", default="320x200", type=lambda text: tuple(int(side) for side in text.split("x")))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--plain", action="store_true")
-    arguments = parser.parse_args()
-    render(scenes.scene(arguments.scene), arguments.out, arguments.size, arguments.spp, arguments.seed, arguments.plain)
+    scenes.run(__doc__, render)

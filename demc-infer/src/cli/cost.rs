@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use demc_data::exr::ExrFile;
-use demc_data::frame::{Presence, check_header};
+use demc_data::frame::{Presence, check_open_header};
 use demc_infer::{Bundle, Ensemble, Tiling, memory};
 use demc_model::{DOWNSAMPLING, ModelConfig};
 use serde::Serialize;
@@ -91,8 +91,9 @@ impl Arguments {
         let tiling = self.tiling.tiling();
         let mut sizes = self.sizes;
         for input in &self.inputs {
-            let layout = layouts.of(&ExrFile::open(input)?, &bundle, say)?;
-            let window = check_header(input, &layout, Presence::Skip)?;
+            let file = ExrFile::open(input)?;
+            let layout = layouts.of(&file, &bundle, say)?;
+            let window = check_open_header(&file, &layout, Presence::Skip)?;
             sizes.push((window.width, window.height));
         }
         let config = bundle.model.config();

@@ -8,6 +8,7 @@
 //! scenes of the data set pass; the scene closest to each limit is named beside it.
 
 use demc_data::Frame;
+use demc_data::frame::POSITIONS;
 
 use super::Warning;
 
@@ -31,7 +32,6 @@ const FACING: f32 = 0.9995;
 
 /// First plane of each buffer.
 const NORMAL: usize = 0;
-const POSITION: usize = 3;
 const TEXTURE1: usize = 6;
 
 type Vector = [f32; 3];
@@ -58,7 +58,7 @@ impl<'a> SurfacePixels<'a> {
         let Frame { width, height, .. } = *frame;
         let hit = |i: usize| match &frame.mask {
             Some(mask) => mask[i] >= 1.0,
-            None => vector(frame, POSITION, i) != [0.0; 3],
+            None => vector(frame, POSITIONS, i) != [0.0; 3],
         };
         let inner = |length: usize| 1..length.saturating_sub(1);
         let count = inner(width).len() * inner(height).len();
@@ -112,7 +112,7 @@ impl<'a> SurfacePixels<'a> {
         let facing = self.share(|i| {
             dot(
                 vector(self.frame, NORMAL, i),
-                vector(self.frame, POSITION, i),
+                vector(self.frame, POSITIONS, i),
             ) < 0.0
         });
         if facing > FACING {
@@ -135,7 +135,7 @@ impl<'a> SurfacePixels<'a> {
 
     /// Absolute cosine between the normal and the surface through the neighbours' positions.
     fn cosine(&self, i: usize) -> f32 {
-        let position = |i| vector(self.frame, POSITION, i);
+        let position = |i| vector(self.frame, POSITIONS, i);
         let across = difference(position(i + 1), position(i - 1));
         let down = difference(
             position(i + self.frame.width),
@@ -220,7 +220,7 @@ mod tests {
                 for channel in 0..3 {
                     let i = y * SIDE + x;
                     features[(NORMAL + channel) * pixels + i] = normal[channel];
-                    features[(POSITION + channel) * pixels + i] =
+                    features[(POSITIONS + channel) * pixels + i] =
                         camera[channel] + distance * ray[channel];
                 }
             }
@@ -272,7 +272,7 @@ mod tests {
         assert!(one(&long).starts_with("normal: its length is 2.00"));
         let turned = mapped(room(CAMERA), NORMAL, |[x, y, z]| [x, z, -y]);
         assert!(one(&turned).contains("normals in camera space and positions in world space"));
-        let camera = mapped(room(CAMERA), POSITION, |p| difference(p, CAMERA));
+        let camera = mapped(room(CAMERA), POSITIONS, |p| difference(p, CAMERA));
         assert!(one(&camera).contains("normals and positions in camera space"));
         let shifted = mapped(room(CAMERA), TEXTURE1, |t| t.map(|x| x - 1.0));
         assert!(one(&shifted).starts_with("texture1: its minimum is -0.50"));

@@ -15,7 +15,7 @@ mod geometry;
 
 use std::fmt;
 
-use demc_data::frame::FEATURE_NAMES;
+use demc_data::frame::{FEATURE_NAMES, POSITIONS, TEXTURES};
 use demc_data::{Frame, FrameSummary};
 
 use crate::Bundle;
@@ -35,9 +35,6 @@ pub const FARTHEST_RMS: f64 = 100.0;
 /// Number of channels whose missed pixels are left out, as in the statistics: normal xyz and
 /// position xyz.
 const GEOMETRY: usize = 6;
-
-/// The position channels.
-const POSITIONS: std::ops::Range<usize> = 3..6;
 
 /// One sign that an image differs from the training data.
 #[derive(Debug, Clone, PartialEq)]
@@ -92,7 +89,7 @@ impl Bundle {
         // Mapped positions cannot be far.
         let mapped = !self.meta.normalizer.position.is_scene();
         let planes = planes.enumerate();
-        for (i, plane) in planes.filter(|(i, _)| !(mapped && POSITIONS.contains(i))) {
+        for (i, plane) in planes.filter(|(i, _)| !(mapped && (POSITIONS..TEXTURES).contains(i))) {
             let mask = frame.mask.as_deref().filter(|_| i < GEOMETRY);
             let (mean, std) = (stats.mean[i], stats.std[i]);
             let rms = rms_z(plane, mask, f64::from(mean), f64::from(std));
