@@ -79,6 +79,9 @@ pub struct ChannelLayout {
     /// without a hit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mask: Option<String>,
+    /// Alpha of the colour, 0 to 1, which is denoised with it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub alpha: Option<String>,
     /// Policies for missing feature buffers.
     #[serde(default)]
     pub missing: MissingPolicies,
@@ -207,7 +210,8 @@ impl ChannelLayout {
             .chain([&self.color])
             .chain(&self.reference)
             .flatten()
-            .chain(&self.mask);
+            .chain(&self.mask)
+            .chain(&self.alpha);
         for name in all {
             if !seen.insert(name) {
                 problems.push(format!("channel {name:?} is named twice"));

@@ -161,6 +161,7 @@ mod tests {
             features: (0..12 * 8).map(|i| feature + (i % 2) as f32).collect(),
             reference: None,
             mask: None,
+            alpha: None,
             clamped: 0,
         }
     }

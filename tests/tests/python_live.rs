@@ -124,6 +124,7 @@ fn weights_trained_in_pytorch_are_imported() {
             features: raw.collect(),
             reference: None,
             mask: None,
+            alpha: None,
             clamped: 0,
         };
         let folder = TempDir::new().expect("a temporary directory");

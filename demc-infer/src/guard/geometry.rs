@@ -233,6 +233,7 @@ mod tests {
             features,
             reference: None,
             mask: Some(vec![1.0; pixels]),
+            alpha: None,
             clamped: 0,
         }
     }
