@@ -1,10 +1,11 @@
-"""Denoises Cycles renders with `demc-infer`: a panel in the render properties, and four operators.
+"""Denoises Cycles renders with `demc-infer`: a panel in the render properties, and operators.
 
 `bpy.ops.demc` works without a window, too:
 
     set_passes()                                 passes, pixel filter, and file format that demc-infer needs
     denoise_file(filepath=..., output=...)       denoises a multilayer EXR file
     denoise_render(), render_and_denoise()       denoise the last render, or render and denoise
+    set_reference(samples=512)                   settings for a training reference of the same view
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import os
 
 import bpy
-from bpy.props import BoolProperty, StringProperty
+from bpy.props import BoolProperty, IntProperty, StringProperty
 
 from .program import Failure, Job
 
@@ -63,16 +64,39 @@ class DEMC_OT_set_passes(ForCycles, bpy.types.Operator):
             layer.use_pass_normal = True
             layer.use_pass_position = True
             layer.cycles.denoising_store_passes = True
-        scene.cycles.use_denoising = False
-        scene.cycles.pixel_filter_type = "BOX"
-        image = scene.render.image_settings
-        # Since Blender 5.0, the formats depend on the media type.
-        if hasattr(image, "media_type"):
-            image.media_type = "MULTI_LAYER_IMAGE"
-        image.file_format = "OPEN_EXR_MULTILAYER"
-        image.color_depth = "32"
-        image.exr_codec = "ZIP"
+        set_output(scene, "MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER")
         return {"FINISHED"}
+
+
+class DEMC_OT_set_reference(ForCycles, bpy.types.Operator):
+    """Sets samples, another seed, pixel filter, and a plain EXR output for a training reference"""
+
+    bl_idname = "demc.set_reference"
+    bl_label = "Set Reference"
+    bl_options = {"REGISTER", "UNDO"}
+
+    samples: IntProperty(name="Samples", description="Samples per pixel", default=512, min=1)
+
+    def execute(self, context):
+        cycles = context.scene.cycles
+        cycles.samples = self.samples
+        cycles.use_adaptive_sampling = False
+        cycles.seed = (cycles.seed + 1) % 2**31
+        set_output(context.scene, "IMAGE", "OPEN_EXR")
+        return {"FINISHED"}
+
+
+def set_output(scene, media_type, file_format):
+    """A 32-bit EXR file, the pixel filter of the training images, and no denoiser of Cycles."""
+    scene.cycles.use_denoising = False
+    scene.cycles.pixel_filter_type = "BOX"
+    image = scene.render.image_settings
+    # Since Blender 5.0, the formats depend on the media type.
+    if hasattr(image, "media_type"):
+        image.media_type = media_type
+    image.file_format = file_format
+    image.color_depth = "32"
+    image.exr_codec = "ZIP"
 
 
 class Denoising:
@@ -246,6 +270,7 @@ class DEMC_PT_panel(bpy.types.Panel):
 CLASSES = (
     DemcPreferences,
     DEMC_OT_set_passes,
+    DEMC_OT_set_reference,
     DEMC_OT_denoise_file,
     DEMC_OT_denoise_render,
     DEMC_OT_render_and_denoise,

@@ -68,6 +68,8 @@ def view(renderer: str, number: int, options: argparse.Namespace) -> dict[str, n
     out |= {f"ref.{name}": reference[name] for name in "RGB"}
     out |= {f"ref.albedo1.{name}": reference[f"albedo.{name}"] for name in "RGB"}
     out |= {f"ref.normal.{name}": reference[f"normal.{name}"] for name in "XYZ"}
+    # The renderers have no mask; normal and position are 0 where no camera ray hits a surface.
+    out["mask.A"] = np.any([noisy[f"{name}.{axis}"] != 0 for name in ("normal", "position") for axis in "XYZ"], 0).astype(np.float32)
     return {name: plane if name.startswith("position") else half(plane) for name, plane in out.items()}
 
 

@@ -98,6 +98,18 @@ class Extension(unittest.TestCase):
         self.assertEqual((image.file_format, image.color_depth), ("OPEN_EXR_MULTILAYER", "32"))
         self.assertFalse(self.scene.cycles.use_denoising)
 
+    def test_a_reference_is_a_plain_file_with_another_seed(self):
+        seed, path = self.scene.cycles.seed, files("plain.exr")
+        bpy.ops.demc.set_reference(samples=2)
+        self.assertEqual((self.scene.cycles.samples, self.scene.cycles.seed), (2, seed + 1))
+        bpy.ops.render.render()
+        bpy.data.images["Render Result"].save_render(path, scene=self.scene)
+        from compare import channels
+
+        planes = channels(Path(path))
+        self.assertLessEqual({"R", "G", "B"}, set(planes))
+        self.assertEqual({str(plane.dtype) for plane in planes.values()}, {"float32"})
+
     def test_a_file_is_denoised_and_loaded(self):
         noisy, denoised = files("noisy.exr"), files("clean.exr")
         self.render(noisy, 4, 0)
