@@ -87,7 +87,9 @@ class ExrFile:
             if header["compression"].name not in LOSSLESS:
                 header["compression"] = OpenEXR.ZIP_COMPRESSION
             if (tiles := header.get("tiles")) is not None:
-                tiles.mode = OpenEXR.ONE_LEVEL  # Smaller levels would show the noise.
+                # Without smaller levels, which would show the noise.
+                header["tiles"] = OpenEXR.TileDescription()
+                header["tiles"].xSize, header["tiles"].ySize = tiles.xSize, tiles.ySize
             for name, old in part.channels.items():
                 pixels = old.pixels
                 if (new := replaced.get((index, name))) is not None:
