@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenEXR
 
-from .layouts import BUFFERS, MISSING, Layout, choose, either, printable
+from .layouts import BUFFERS, MISSING, Layout, choose, either, printable, require
 
 LOSSLESS = ("NO_COMPRESSION", "RLE_COMPRESSION", "ZIPS_COMPRESSION", "ZIP_COMPRESSION", "PIZ_COMPRESSION")
 """Compressions that keep all bits of all channels. `ExrFile.write` replaces others by ZIP."""
@@ -51,15 +52,15 @@ class ExrFile:
             layer = part.header.get("name", "") if len(self.parts) > 1 else ""
             for name, channel in part.channels.items():
                 if channel.pixels.dtype == object or (channel.xSampling, channel.ySampling) != (1, 1):
-                    raise ValueError(f"{path}: channel {printable(name)}: deep and subsampled channels are not supported")
+                    unsupported = "deep and subsampled channels are not supported"
+                    raise ValueError(f"{path}: channel {printable(name)}: {unsupported}")
                 full = name if not layer or name.startswith(f"{layer}.") else f"{layer}.{name}"
                 self.channels.setdefault(printable(full), Channel(index, name, channel.pixels))
 
     def planes(self, names: Iterable[str]) -> np.ndarray:
         """The named channels [C, H, W] as float32. Raises ValueError for missing channels and different sizes."""
         names = list(names)
-        if missing := [name for name in dict.fromkeys(names) if name not in self.channels]:
-            raise ValueError(f"{self.path}: no channel {', '.join(missing)}; the file has {', '.join(self.channels)}")
+        require(self.path, names, self.channels)
         first = self.window(names[0])
         for name in names[1:]:
             if (other := self.window(name)) != first:
@@ -108,9 +109,21 @@ class Frame:
 
     color: np.ndarray  # [3, H, W] float32: linear radiance, not negative
     features: np.ndarray  # [12, H, W] float32: normal, position, albedo (first hit), albedo (second hit)
-    reference: np.ndarray | None  # [3, H, W] float32, if the file has it
-    layout: Layout
+    layout: Layout  # without the buffers that the file lacks
     file: ExrFile
+
+    @cached_property
+    def reference(self) -> np.ndarray | None:
+        """Reference colour [3, H, W] float32, if the file has it: linear radiance, not negative.
+
+        Raises ValueError as `read_exr`, which does not look at the reference.
+        """
+        names = self.layout.channels.get("reference")
+        if names is None:
+            return None
+        planes = self.file.planes([self.layout.channels["color"][0], *names])[1:]
+        check_finite(self.file.path, names, planes)
+        return planes.clip(0)
 
     def write(self, path: str | os.PathLike, image: np.ndarray, precision: str | None = None) -> None:
         """Writes the file with `image` [3, H, W] in place of its colour (`ExrFile.write`)."""
@@ -144,21 +157,17 @@ def read_exr(
     chosen = choose(file.path, file.channels, layout, layer, policies | dict(missing or {}), own)
 
     wanted = {"color": chosen.channels["color"]}
-    for buffer in (*BUFFERS, "reference"):
+    for buffer in BUFFERS:
         names = chosen.channels.get(buffer, ())
         # If one of three channels is present, the buffer counts as present.
-        if names and (chosen.missing.get(buffer) == "error" or any(name in file.channels for name in names)):
+        if names and (chosen.missing[buffer] == "error" or any(name in file.channels for name in names)):
             wanted[buffer] = names
     names = [name for buffer in wanted.values() for name in buffer]
     planes = file.planes(names)
     found = {buffer: planes[3 * index : 3 * index + 3] for index, buffer in enumerate(wanted)}
     if (position := found.get("position")) is not None:
         position[:, np.isinf(position).all(0)] = 0  # LuxCore's, where a camera ray hits nothing.
-    for name, plane in zip(names, planes):
-        if (bad := ~np.isfinite(plane)).any():
-            y, x = np.argwhere(bad)[0]
-            count = f"{bad.sum()} NaN or infinite samples in all"
-            raise ValueError(f"{path}: channel {name}: {plane[y, x]} at x {x}, y {y} ({count})")
+    check_finite(file.path, names, planes)
 
     for buffer in BUFFERS:
         if buffer not in found:
@@ -167,10 +176,18 @@ def read_exr(
     return Frame(
         color=found["color"].clip(0),
         features=np.concatenate([found[buffer] for buffer in BUFFERS]),
-        reference=found["reference"].clip(0) if "reference" in found else None,
         layout=chosen.present(file.channels),
         file=file,
     )
+
+
+def check_finite(path: Path, names: Iterable[str], planes: np.ndarray) -> None:
+    """Raises ValueError with the first NaN or infinite sample of planes [C, H, W]."""
+    for name, plane in zip(names, planes):
+        if (bad := ~np.isfinite(plane)).any():
+            y, x = np.argwhere(bad)[0]
+            count = f"{bad.sum()} NaN or infinite samples in all"
+            raise ValueError(f"{path}: channel {name}: {plane[y, x]} at x {x}, y {y} ({count})")
 
 
 def write_whole(path: Path, file: OpenEXR.File) -> None:

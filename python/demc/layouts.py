@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -31,13 +31,14 @@ class Layout:
 
     name: str  # for messages
     channels: Mapping[str, tuple[str, ...]]  # of color, BUFFERS, reference, mask; without absent ones
-    missing: Mapping[str, str]  # policy of each of BUFFERS: error, zeros, or copy-texture1
+    missing: Mapping[str, str]  # of each of BUFFERS: error, zeros, or copy-texture1
     layer: str | None = None  # the view layer in place of `*`
 
     @classmethod
     def from_table(cls, name: str, table: Mapping) -> Layout:
         """A layout from parsed TOML or JSON. Raises ValueError with all its mistakes."""
-        problems = [f"unknown key {key}" for key in table if key not in ("color", *BUFFERS, "reference", "mask", "missing")]
+        known = ("color", *BUFFERS, "reference", "mask", "missing")
+        problems = [f"unknown key {key}" for key in table if key not in known]
         channels, given = {}, table.get("missing", {})
         for buffer in ("color", *BUFFERS, "reference"):
             names = table.get(buffer)
@@ -63,7 +64,8 @@ class Layout:
             elif policy == "error" and buffer not in table:
                 problems.append(f"{buffer} names no channels: name them or set missing.{buffer}")
         names = [channel for buffer in channels.values() for channel in buffer]
-        problems += [f"channel {json.dumps(name)} is named twice" for name in dict.fromkeys(names) if names.count(name) > 1]
+        twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
+        problems += [f"channel {json.dumps(name)} is named twice" for name in twice]
         if problems:
             raise ValueError(f"channel layout {name}: {'; '.join(problems)}")
         return cls(name, channels, missing)
@@ -100,7 +102,7 @@ class Layout:
         if layer in layers:
             return self.with_layer(layer)
         if not layers:
-            return self  # The colour is missing, as its reader reports.
+            require(path, self.channels["color"], found)  # Raises: a name with `*` is in no file.
         if layer is not None:
             raise no_layer(path, layer, layers)
         if len(layers) > 1:
@@ -206,7 +208,14 @@ def detect(path: Path, found: Collection[str], missing: Mapping[str, str], layer
     raise problem(path, f"no preset fits; the nearest, {nearest[0]}, lacks {', '.join(nearest[1])}")
 
 
-def choose(path: Path, found: Collection[str], layout: str | None, layer: str | None, missing: Mapping[str, str], own: Mapping | None) -> Layout:
+def choose(
+    path: Path,
+    found: Collection[str],
+    layout: str | None,
+    layer: str | None,
+    missing: Mapping[str, str],
+    own: Mapping | None,
+) -> Layout:
     """The layout of a file: `layout`, otherwise the model's `own` if it fits, otherwise detected."""
     if layout is not None:
         return resolve(layout).in_file(path, found, layer).allowing(missing)
@@ -218,6 +227,12 @@ def choose(path: Path, found: Collection[str], layout: str | None, layer: str | 
         if fitting is not None and not fitting.lacking(found):
             return fitting
     return detect(path, found, missing, layer)
+
+
+def require(path: Path, names: Iterable[str], found: Collection[str]) -> None:
+    """Raises ValueError for names that are not among the channels `found` of a file."""
+    if missing := [name for name in dict.fromkeys(names) if name not in found]:
+        raise ValueError(f"{path}: no channel {', '.join(missing)}; the file has {', '.join(found)}")
 
 
 def printable(name: str) -> str:

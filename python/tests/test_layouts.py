@@ -99,6 +99,7 @@ class Detection(Files):
     def test_the_nearest_preset_is_named_with_what_it_lacks(self) -> None:
         self.write(self.planes(name for name in MITSUBA if name != "normal.Y"))
         self.refused("no preset fits; the nearest, mitsuba3, lacks normal.Y")
+        self.refused("no channel *.Combined.R, *.Combined.G, *.Combined.B; the file has", "cycles")
         self.write(self.planes(["beauty.r", "depth"]))
         self.refused("no preset has any of its channels: beauty.r, depth")
 
@@ -138,8 +139,15 @@ class Buffers(Files):
     def test_a_reference_is_read_if_present(self) -> None:
         self.write(self.planes([*MITSUBA, "ref.R", "ref.G", "ref.B"]))
         self.assertEqual(demc.read_exr(self.path).reference.shape, (3, 4, 5))
+        # Denoising does not need it.
         self.write(self.planes([*MITSUBA, "ref.R"]))
-        self.refused("no channel ref.G, ref.B; the file has")
+        with self.assertRaisesRegex(ValueError, "no channel ref.G, ref.B; the file has"):
+            demc.read_exr(self.path).reference
+        planes = self.planes([*MITSUBA, "ref.R", "ref.G", "ref.B"])
+        planes["ref.G"][0, 1] = np.inf
+        self.write(planes)
+        with self.assertRaisesRegex(ValueError, "channel ref.G: inf at x 1, y 0"):
+            demc.read_exr(self.path).reference
 
     def test_parts_of_different_sizes_are_refused(self) -> None:
         layout = self.folder / "parts.toml"
