@@ -81,6 +81,8 @@ class ExrFile:
         "half", "float", or by default that of the file (float instead of uint). Lossy compression
         becomes ZIP. The output is complete or absent.
         """
+        if precision not in (None, *PRECISIONS):
+            raise ValueError(f"precision {precision!r}: expected {' or '.join(PRECISIONS)}")
         replaced = {(self.channels[name].part, self.channels[name].name): plane for name, plane in planes.items()}
         parts = []
         for index, part in enumerate(self.parts):
@@ -151,7 +153,7 @@ def read_exr(
     channels, different sizes, NaN, and infinite values.
     """
     meta = getattr(bundle, "meta", bundle)
-    own = meta["layout"] if meta else None
+    own = meta.get("layout") if meta else None
     policies = MISSING if own is None else either(dict.fromkeys(BUFFERS, "error") | own.get("missing", {}), MISSING)
     file = ExrFile(path)
     chosen = choose(file.path, file.channels, layout, layer, policies | dict(missing or {}), own)
