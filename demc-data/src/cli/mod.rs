@@ -1,8 +1,11 @@
 //! The command line: arguments and dispatch.
 
 mod inspect;
+mod merge;
 mod stats;
 
+use std::ffi::OsString;
+use std::fmt;
 use std::io::{ErrorKind, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -11,7 +14,7 @@ use anyhow::{Context, Result};
 use clap::{Args, Parser, Subcommand};
 use demc_data::Split;
 
-/// Inspects images and data sets for training a DEMC denoiser.
+/// Prepares and inspects images and data sets for training a DEMC denoiser.
 ///
 /// Exit status: 0 success, 1 a file or data set cannot be used, 2 wrong arguments.
 #[derive(Parser)]
@@ -36,6 +39,12 @@ enum DataCommand {
     /// and position exclude misses (`mask.A` = 0). The command checks every file's header and reads
     /// the split's files completely.
     Stats(StatsArguments),
+    /// Join the channels of several OpenEXR files in one file.
+    ///
+    /// `FILE` keeps its channel names; `NAME=FILE` puts `NAME.` before each of them. Samples keep
+    /// their types and bits. Attributes of later files are added if the earlier ones lack them. All
+    /// files must have one size and data window.
+    Merge(MergeArguments),
 }
 
 #[derive(Args)]
@@ -57,7 +66,7 @@ struct StatsArguments {
     /// Directory of the data set, with its manifest.json
     #[arg(value_name = "DIR")]
     root: PathBuf,
-    /// Channel layout: demc-exr, mitsuba3, pbrt-v4, cycles, fbksd, or a TOML file
+    /// Channel layout: demc-exr, mitsuba3, pbrt-v4, cycles, luxcore, fbksd, or a TOML file
     #[arg(long, default_value = "demc-exr")]
     layout: String,
     /// The split to measure
@@ -66,6 +75,22 @@ struct StatsArguments {
     /// Print one JSON object instead of a table
     #[arg(long)]
     json: bool,
+}
+
+#[derive(Args)]
+#[command(
+    after_help = "Example:\n  demc-data merge -o scene.exr noisy.exr albedo=noisy.albedo.exr ref=reference.exr"
+)]
+struct MergeArguments {
+    /// The file to write
+    #[arg(short, long, value_name = "OUT.exr")]
+    output: PathBuf,
+    /// Files to join; a path with `=` in its first directory or name is written as `./PATH`
+    #[arg(required = true, value_name = "[NAME=]FILE")]
+    files: Vec<OsString>,
+    /// Replace an existing output
+    #[arg(long)]
+    overwrite: bool,
 }
 
 impl Cli {
@@ -79,8 +104,27 @@ impl Cli {
             DataCommand::Inspect(args) => inspect::run(&args.files, args.json),
             DataCommand::Stats(args) => stats::run(&args.root, &args.layout, args.split, args.json)
                 .map(|()| ExitCode::SUCCESS),
+            DataCommand::Merge(args) => merge::run(&args.output, &args.files, args.overwrite)
+                .map(|()| ExitCode::SUCCESS),
         }
     }
+}
+
+/// Arguments that contradict each other or the files on disk.
+#[derive(Debug)]
+pub struct UsageError(String);
+
+impl fmt::Display for UsageError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for UsageError {}
+
+/// Text from a file or an argument, safe to print in one line.
+fn printable(text: &str) -> String {
+    text.replace(char::is_control, "\u{fffd}")
 }
 
 /// Prints an error as one line on standard error.
