@@ -25,6 +25,7 @@ pub mod cache;
 pub mod channel;
 pub mod config;
 pub mod dataset;
+pub mod doctor;
 pub mod error;
 pub mod exr;
 pub mod file;

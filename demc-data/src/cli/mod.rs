@@ -1,5 +1,6 @@
 //! The command line: arguments and dispatch.
 
+mod doctor;
 mod inspect;
 mod merge;
 mod stats;
@@ -45,6 +46,12 @@ enum DataCommand {
     /// their types and bits. Attributes of later files are added if the earlier ones lack them. All
     /// files must have one size and data window.
     Merge(MergeArguments),
+    /// Look for mistakes in a data set that training would not report.
+    ///
+    /// It checks the manifest, exposures, the pixel filter, references, duplicates, and features, and
+    /// prints one line per problem: the scenes concerned, what was measured, and the likely cause.
+    /// The exit status is 1 if there are problems.
+    Doctor(DoctorArguments),
 }
 
 #[derive(Args)]
@@ -93,6 +100,23 @@ struct MergeArguments {
     overwrite: bool,
 }
 
+#[derive(Args)]
+#[command(after_help = "Example:\n  demc-data doctor data/sample")]
+struct DoctorArguments {
+    /// Directory of the data set, with its manifest.json
+    #[arg(value_name = "DIR")]
+    root: PathBuf,
+    /// Channel layout: a preset or a TOML file; by default the preset that fits the first file
+    #[arg(long, value_name = "PRESET|FILE")]
+    layout: Option<String>,
+    /// Patch size of training in pixels
+    #[arg(long, default_value_t = 128, value_name = "PIXELS")]
+    patch_size: usize,
+    /// Print one JSON object instead of lines
+    #[arg(long)]
+    json: bool,
+}
+
 impl Cli {
     /// Runs the command and returns its exit status; `inspect` has already reported the files that
     /// it could not read.
@@ -104,6 +128,12 @@ impl Cli {
             DataCommand::Inspect(args) => inspect::run(&args.files, args.json),
             DataCommand::Stats(args) => stats::run(&args.root, &args.layout, args.split, args.json)
                 .map(|()| ExitCode::SUCCESS),
+            DataCommand::Doctor(args) => doctor::run(
+                &args.root,
+                args.layout.as_deref(),
+                args.patch_size,
+                args.json,
+            ),
             DataCommand::Merge(args) => merge::run(&args.output, &args.files, args.overwrite)
                 .map(|()| ExitCode::SUCCESS),
         }
