@@ -1,6 +1,7 @@
 //! The command line: arguments and dispatch.
 
 mod doctor;
+mod index;
 mod inspect;
 mod merge;
 mod stats;
@@ -46,6 +47,12 @@ enum DataCommand {
     /// their types and bits. Attributes of later files are added if the earlier ones lack them. All
     /// files must have one size and data window.
     Merge(MergeArguments),
+    /// Write the manifest.json of a directory of scenes.
+    ///
+    /// Each OpenEXR file in the directory and below becomes a scene; other files, hidden files, and
+    /// linked directories are ignored and counted. Sizes come from the headers. Every file must fit one
+    /// layout and have a reference. A base scene must not be in both splits.
+    Index(IndexArguments),
     /// Look for mistakes in a data set that training would not report.
     ///
     /// It checks the manifest, exposures, the pixel filter, references, duplicates, and features, and
@@ -117,6 +124,29 @@ struct DoctorArguments {
     json: bool,
 }
 
+#[derive(Args)]
+#[command(
+    after_help = "Examples:\n  demc-data index renders --test 'kitchen*'\n  demc-data index renders --test 'bath/*' --base '^([^/]+)/'"
+)]
+struct IndexArguments {
+    /// Directory of the scenes
+    #[arg(value_name = "DIR")]
+    root: PathBuf,
+    /// Glob pattern of the test scenes: relative paths or file names (repeatable)
+    #[arg(long, value_name = "PATTERN")]
+    test: Vec<String>,
+    /// Regular expression whose only group is the base scene, searched in the relative path without
+    /// extension; by default the file name without the number at its end
+    #[arg(long, value_name = "REGEX")]
+    base: Option<String>,
+    /// Channel layout: a preset or a TOML file; by default the preset that fits each file
+    #[arg(long, value_name = "PRESET|FILE")]
+    layout: Option<String>,
+    /// Replace an existing manifest; keys of its scenes that this command does not set stay
+    #[arg(long)]
+    overwrite: bool,
+}
+
 impl Cli {
     /// Runs the command and returns its exit status; `inspect` has already reported the files that
     /// it could not read.
@@ -134,6 +164,7 @@ impl Cli {
                 args.patch_size,
                 args.json,
             ),
+            DataCommand::Index(args) => index::run(&args).map(|()| ExitCode::SUCCESS),
             DataCommand::Merge(args) => merge::run(&args.output, &args.files, args.overwrite)
                 .map(|()| ExitCode::SUCCESS),
         }
@@ -159,7 +190,7 @@ fn printable(text: &str) -> String {
 
 /// Prints an error as one line on standard error.
 pub fn report(error: &anyhow::Error) {
-    eprintln!("error: {error:#}");
+    eprintln!("{}", printable(&format!("error: {error:#}")));
 }
 
 fn parse_split(text: &str) -> Result<Split, String> {
