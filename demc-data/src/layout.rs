@@ -31,7 +31,7 @@ pub use detect::{FileLayout, detect};
 pub const ANY_LAYER: &str = "*.";
 
 /// The built-in layouts: name and TOML text (`configs/renderers/`).
-pub const PRESETS: [(&str, &str); 5] = [
+pub const PRESETS: [(&str, &str); 6] = [
     (
         "demc-exr",
         include_str!("../../configs/renderers/demc-exr.toml"),
@@ -47,6 +47,10 @@ pub const PRESETS: [(&str, &str); 5] = [
     (
         "cycles",
         include_str!("../../configs/renderers/cycles.toml"),
+    ),
+    (
+        "luxcore",
+        include_str!("../../configs/renderers/luxcore.toml"),
     ),
     ("fbksd", include_str!("../../configs/renderers/fbksd.toml")),
 ];
