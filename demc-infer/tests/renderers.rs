@@ -1,4 +1,4 @@
-//! The bundled model on files that Blender Cycles and Mitsuba wrote, as they are.
+//! The bundled model on files of Blender Cycles, Mitsuba and LuxCore.
 
 mod common;
 
@@ -13,13 +13,18 @@ use demc_data::plane::Plane;
 use demc_infer::{Bundle, device};
 use demc_model::metrics::rel_mse_image;
 
-const FILES: [(&str, &str, &str); 3] = [
+const FILES: [(&str, &str, &str); 4] = [
     ("cycles-4.5.exr", "cycles-reference.exr", "layout cycles"),
     ("cycles-5.0.exr", "cycles-reference.exr", "layout cycles"),
     (
         "mitsuba-3.9.exr",
         "mitsuba-reference.exr",
         "layout mitsuba3",
+    ),
+    (
+        "luxcore-2.11.exr",
+        "luxcore-reference.exr",
+        "layout luxcore",
     ),
 ];
 
@@ -97,28 +102,121 @@ fn bundle() -> Bundle {
     Bundle::load(&model, &device::parse("flex").expect("the CPU")).expect("the model")
 }
 
-/// RelMSE at 0.001 and 1000 times the exposure, relative to the unchanged file.
+/// RelMSE of a stock file whose frame `change` has changed, relative to the unchanged file. `back` is
+/// the factor that undoes a change of the exposure.
+fn ratio(
+    bundle: &Bundle,
+    name: &str,
+    reference: &str,
+    back: f32,
+    change: impl Fn(&mut Frame),
+) -> f64 {
+    let mut file = open(&path(name));
+    let layout = detect(&file, bundle.missing(), None).expect(name).layout;
+    let frame = decode_input(&mut file, &layout).expect(name);
+    let reference = color(&path(reference));
+    let error = |frame: &Frame, back: f32| {
+        let mut image = bundle.denoise(frame).expect("denoised");
+        image.iter_mut().for_each(|x| *x *= back);
+        rel_mse_image(&image, &reference)
+    };
+    let mut changed = frame.clone();
+    change(&mut changed);
+    error(&changed, back) / error(&frame, 1.0)
+}
+
+/// The normals, positions or textures of a frame.
+fn buffer(frame: &mut Frame, index: usize) -> &mut [f32] {
+    let size = 3 * frame.width * frame.height;
+    &mut frame.features[index * size..][..size]
+}
+
 #[test]
 fn the_exposure_of_a_stock_file_hardly_matters() {
     let bundle = bundle();
     for (name, reference, _) in FILES {
-        let mut file = open(&path(name));
-        let layout = detect(&file, bundle.missing(), None).expect(name).layout;
-        let frame = decode_input(&mut file, &layout).expect(name);
-        let reference = color(&path(reference));
-        let error = |factor: f32| {
-            let scaled = Frame {
-                color: frame.color.iter().map(|x| x * factor).collect(),
-                ..frame.clone()
-            };
-            let mut image = bundle.denoise(&scaled).expect("denoised");
-            image.iter_mut().for_each(|x| *x /= factor);
-            rel_mse_image(&image, &reference)
-        };
-        let unchanged = error(1.0);
         for factor in [1e-3, 1e3] {
-            let ratio = error(factor) / unchanged;
-            assert!((ratio - 1.0).abs() < 0.2, "{name}, {factor}: {ratio}");
+            let ratio = ratio(&bundle, name, reference, 1.0 / factor, |frame| {
+                frame.color.iter_mut().for_each(|x| *x *= factor);
+            });
+            assert!((ratio - 1.0).abs() < 0.05, "{name}, {factor}: {ratio}");
         }
+    }
+}
+
+#[test]
+fn origin_and_unit_of_the_positions_hardly_matter() {
+    let bundle = bundle();
+    for (name, reference, _) in FILES {
+        let moves: [(f32, f32); 3] = [(1.0, 1e6), (1e3, 0.0), (1e3, 1e6)];
+        for (factor, offset) in moves {
+            let ratio = ratio(&bundle, name, reference, 1.0, |frame| {
+                for x in buffer(frame, 1).iter_mut().filter(|x| **x != 0.0) {
+                    *x = *x * factor + offset;
+                }
+            });
+            assert!(
+                (ratio - 1.0).abs() < 0.05,
+                "{name}, {factor}, {offset}: {ratio}"
+            );
+        }
+    }
+}
+
+/// The camera of the scenes looks down by about half a radian and does not look along an axis.
+#[test]
+fn normals_in_camera_space_hardly_matter() {
+    let bundle = bundle();
+    let (turn, tilt) = (0.8_f32.sin_cos(), 0.5_f32.sin_cos());
+    for (name, reference, _) in FILES {
+        let ratio = ratio(&bundle, name, reference, 1.0, |frame| {
+            let pixels = frame.width * frame.height;
+            let normals = buffer(frame, 0);
+            for i in 0..pixels {
+                let [x, y, z] = [0, 1, 2].map(|axis| normals[axis * pixels + i]);
+                let (x, y) = (turn.1 * x - turn.0 * y, turn.0 * x + turn.1 * y);
+                let (y, z) = (tilt.1 * y - tilt.0 * z, tilt.0 * y + tilt.1 * z);
+                for (axis, value) in [x, z, -y].into_iter().enumerate() {
+                    normals[axis * pixels + i] = value;
+                }
+            }
+        });
+        assert!((ratio - 1.0).abs() < 0.05, "{name}: {ratio}");
+    }
+}
+
+#[test]
+fn a_missing_position_hardly_matters() {
+    let bundle = bundle();
+    for (name, reference, _) in FILES {
+        let ratio = ratio(&bundle, name, reference, 1.0, |frame| {
+            buffer(frame, 1).fill(0.0)
+        });
+        assert!((ratio - 1.0).abs() < 0.1, "{name}: {ratio}");
+    }
+}
+
+/// The sample has a second texture, which stock renderers lack.
+#[test]
+fn a_missing_second_texture_hardly_matters() {
+    let bundle = bundle();
+    let scenes = Path::new(env!("CARGO_MANIFEST_DIR")).join("../data/sample/test");
+    let layout = demc_data::ChannelLayout::resolve("demc-exr").expect("a preset");
+    for name in [
+        "col-classroom-1",
+        "col-dining-room-1",
+        "gen-room-test-1",
+        "gen-table-test-1",
+    ] {
+        let frame = demc_data::read_frame(&scenes.join(format!("{name}.exr")), &layout);
+        let frame = frame.expect("the sample is sound");
+        let reference = frame.reference.clone().expect("the sample has one");
+        let mut without = frame.clone();
+        let first = buffer(&mut without, 2).to_vec();
+        buffer(&mut without, 3).copy_from_slice(&first);
+        let [with, without] = [&frame, &without]
+            .map(|frame| rel_mse_image(&bundle.denoise(frame).expect("denoised"), &reference));
+        let ratio = without / with;
+        assert!((ratio - 1.0).abs() < 0.1, "{name}: {ratio}");
     }
 }

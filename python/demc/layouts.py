@@ -30,14 +30,14 @@ class Layout:
     """The channel names of a renderer's files."""
 
     name: str  # for messages
-    channels: Mapping[str, tuple[str, ...]]  # of color, BUFFERS, reference, mask; without absent ones
+    channels: Mapping[str, tuple[str, ...]]  # of color, BUFFERS, reference, mask, alpha; without absent ones
     missing: Mapping[str, str]  # of each of BUFFERS: error, zeros, or copy-texture1
     layer: str | None = None  # the view layer in place of `*`
 
     @classmethod
     def from_table(cls, name: str, table: Mapping) -> Layout:
         """A layout from parsed TOML or JSON. Raises ValueError with all its mistakes."""
-        known = ("color", *BUFFERS, "reference", "mask", "missing")
+        known = ("color", *BUFFERS, "reference", "mask", "alpha", "missing")
         problems = [f"unknown key {key}" for key in table if key not in known]
         channels, given = {}, table.get("missing", {})
         for buffer in ("color", *BUFFERS, "reference"):
@@ -46,10 +46,11 @@ class Layout:
                 channels[buffer] = tuple(names)
             elif names is not None or buffer == "color":
                 problems.append(f"{buffer}: expected three names of channels")
-        if isinstance(mask := table.get("mask"), str):
-            channels["mask"] = (mask,)
-        elif mask is not None:
-            problems.append("mask: expected the name of a channel")
+        for key in ("mask", "alpha"):
+            if isinstance(name_of_one := table.get(key), str):
+                channels[key] = (name_of_one,)
+            elif name_of_one is not None:
+                problems.append(f"{key}: expected the name of a channel")
         if not isinstance(given, Mapping):
             problems.append("missing: expected a table")
             given = {}

@@ -141,7 +141,9 @@ impl Details {
         for y in FARTHEST..height.saturating_sub(FARTHEST) {
             for x in FARTHEST..width.saturating_sub(FARTHEST) {
                 let rows = (y - FARTHEST..=y + FARTHEST).map(|row| row * width + x - FARTHEST);
-                let sum: f64 = rows.flat_map(|start| &log[start..=start + 2 * FARTHEST]).sum();
+                let sum: f64 = rows
+                    .flat_map(|start| &log[start..=start + 2 * FARTHEST])
+                    .sum();
                 values[y * width + x] = log[y * width + x] - sum / 25.0;
             }
         }
@@ -170,7 +172,11 @@ impl Details {
 
     /// Mean product with another image's details, of which the pixel at `shift` is taken.
     fn covariance(&self, other: &Self, shift: (isize, isize)) -> f64 {
-        mean(self.moved((0, 0)).zip(other.moved(shift)).map(|(a, b)| a * b))
+        mean(
+            self.moved((0, 0))
+                .zip(other.moved(shift))
+                .map(|(a, b)| a * b),
+        )
     }
 }
 

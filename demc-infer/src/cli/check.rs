@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use demc_data::exr::ExrFile;
 use demc_data::frame::{FEATURE_NAMES, TEXTURES, decode_input};
+use demc_data::noise::{CORRELATED, correlation};
 use demc_data::ranges::Range;
 use demc_data::transform::MAX_ALBEDO;
 use demc_data::{Frame, FrameSummary};
@@ -119,6 +120,7 @@ impl FileCheck {
             .map(|warning| warning.to_string())
             .collect();
         warnings.extend(bright_albedo(&frame));
+        warnings.extend(correlated_noise(&frame));
         if let Err(refused) = bundle.check_statistics(&frame) {
             warnings.push(format!("`denoise` refuses this image: {refused}"));
         }
@@ -193,6 +195,17 @@ fn bright_albedo(frame: &Frame) -> Option<String> {
         format!(
             "albedo: {bright} samples are above {MAX_ALBEDO}, up to {largest:.1}, and count as {MAX_ALBEDO}; \
              is a lamp seen in metal, or is this another buffer?"
+        )
+    })
+}
+
+/// A warning about noise of neighbouring pixels that correlates.
+fn correlated_noise(frame: &Frame) -> Option<String> {
+    let found = correlation(&frame.color, frame.width, frame.height)?;
+    (found >= CORRELATED).then(|| {
+        format!(
+            "noise: that of neighbouring pixels correlates by {found:.2}; set the renderer's pixel filter to box, \
+             one pixel wide"
         )
     })
 }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
+use demc_data::ChannelLayout;
 use demc_infer::verify::{Runtime, TOLERANCE, verify};
 use demc_infer::{Bundle, Names, Precision};
 
@@ -40,6 +41,10 @@ pub struct Arguments {
     /// f32
     #[arg(long, value_enum, default_value = "f32")]
     precision: PrecisionFlag,
+    /// Channel layout to store instead of that of the training data: demc-exr, mitsuba3, pbrt-v4,
+    /// cycles, fbksd, luxcore, or a TOML file
+    #[arg(long, value_name = "PRESET|FILE")]
+    layout: Option<String>,
     /// Output file. An existing file is replaced, but never the model itself
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
@@ -88,7 +93,11 @@ impl Arguments {
             PrecisionFlag::F32 => Precision::F32,
             PrecisionFlag::F16 => Precision::F16,
         };
-        let bundle = file.into_bundle(&Device::flex())?;
+        let mut bundle = file.into_bundle(&Device::flex())?;
+        if let Some(name) = &self.layout {
+            let layout = ChannelLayout::resolve(name);
+            bundle.meta.layout = layout.map_err(|error| UsageError(error.to_string()))?;
+        }
         let output = self.output.display();
         match self.format {
             Format::Safetensors => {
