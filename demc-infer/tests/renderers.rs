@@ -220,3 +220,31 @@ fn a_missing_second_texture_hardly_matters() {
         assert!((ratio - 1.0).abs() < 0.1, "{name}: {ratio}");
     }
 }
+
+/// The alpha of an image on a transparent film is denoised; where it does not vary, it stays.
+#[test]
+fn alpha_is_denoised_with_the_colour() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let (input, output) = (path("cycles-alpha.exr"), directory.path().join("out.exr"));
+    demc_infer(arguments!["denoise", input, "-o", output]).success();
+    let alpha = |path: &Path| {
+        let planes = open(path).read(&["ViewLayer.Combined.A"]);
+        planes.expect("alpha")[0].to_f32()
+    };
+    let reference = alpha(&path("cycles-alpha-reference.exr"));
+    let [noisy, denoised] = [&input, &output].map(|path| alpha(path));
+    let error = |image: &[f32]| {
+        let pairs = image.iter().zip(&reference);
+        pairs.map(|(a, b)| (a - b) * (a - b)).sum::<f32>()
+    };
+    assert!(
+        error(&denoised) < 0.7 * error(&noisy),
+        "{} {}",
+        error(&denoised),
+        error(&noisy)
+    );
+    assert!(denoised.iter().all(|alpha| (0.0..=1.0).contains(alpha)));
+    assert_eq!((denoised[0], noisy[0]), (0.0, 0.0));
+    let opaque = denoised.iter().filter(|alpha| **alpha == 1.0).count();
+    assert!(opaque > 100, "{opaque} pixels stay opaque");
+}

@@ -42,6 +42,7 @@ class Scene:
     target: tuple
     fov: float
     sky: tuple
+    transparent: bool = False
     meshes: list = field(default_factory=list)
 
 
@@ -105,7 +106,14 @@ def clutter(rng, scene, count, area, low):
 
 
 def scene(number: int) -> Scene:
-    """Scene `number`: a room, a room with a mirror, things under the sky, a closet with a small lamp, in turn."""
+    """Scene `number`: a room, a room with a mirror, things under the sky, a closet with a small lamp, in turn.
+
+    Scene 0 has some objects of scene 7 alone, on a transparent film (Cycles only).
+    """
+    if number == 0:
+        result = scene(7)
+        result.meshes, result.transparent = result.meshes[-9:], True
+        return result
     rng = random.Random(number)
     kind = (number - 1) % 4
     angle, height = rng.uniform(0.3, 1.2), rng.uniform(1.0, 1.7)

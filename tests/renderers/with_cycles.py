@@ -97,6 +97,7 @@ def render(scene, out, size, spp, seed, plain):
     target.cycles.use_adaptive_sampling = False
     target.cycles.use_denoising = False
     target.cycles.seed = seed
+    target.render.film_transparent = scene.transparent
     target.cycles.max_bounces = 12
     target.render.resolution_x, target.render.resolution_y = size
     target.render.resolution_percentage = 100
