@@ -123,7 +123,7 @@ class Layout:
 
     def present(self, found: Collection[str]) -> Layout:
         """This layout without the buffers that the file lacks."""
-        there = {buffer: names for buffer, names in self.channels.items() if names[0] in found}
+        there = {buffer: names for buffer, names in self.channels.items() if any(name in found for name in names)}
         return replace(self, channels={"color": self.channels["color"]} | there)
 
     def describe(self) -> str:
