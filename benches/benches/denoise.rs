@@ -186,6 +186,7 @@ fn repeated(frame: &Frame) -> Frame {
         features: planes(&frame.features),
         reference: None,
         mask: None,
+        alpha: None,
         clamped: 0,
     }
 }

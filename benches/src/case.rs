@@ -55,6 +55,7 @@ pub fn network(width: usize) -> Bundle {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
         position: PositionSpace::Scene,
+        exposure_level: None,
         features: FeatureStats {
             mean: [0.0; FEATURES],
             std: [1.0; FEATURES],

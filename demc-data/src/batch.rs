@@ -5,6 +5,7 @@
 
 use crate::augment::{Augment, Variation};
 use crate::cache::{CacheUsage, SceneCache};
+use crate::dropout::{Dropout, drop_buffers};
 use crate::frame::{FEATURES, FramePlanes, TEXTURES};
 use crate::patch::{EpochOrders, Patch, patches};
 use crate::plane::Plane;
@@ -39,6 +40,7 @@ pub struct PatchSource {
     patch_size: usize,
     batch_size: usize,
     augment: Augment,
+    dropout: Dropout,
     workers: usize,
     seed: u64,
 }
@@ -46,6 +48,8 @@ pub struct PatchSource {
 struct PatchDraw {
     patch: Patch,
     variation: Variation,
+    /// Which of normal, position, texture1 and texture2 are dropped.
+    dropped: [bool; 4],
 }
 
 /// One patch and its part of the batch's buffers.
@@ -86,7 +90,7 @@ impl PatchSource {
             cache: SceneCache::new(
                 scenes,
                 layout,
-                config.position,
+                config.preparation(),
                 config.cache_mib.saturating_mul(1 << 20),
             ),
             epoch_orders: EpochOrders::new(patches.len(), seed),
@@ -95,6 +99,7 @@ impl PatchSource {
             patch_size: config.patch_size,
             batch_size: config.batch_size,
             augment: config.augment,
+            dropout: config.dropout,
             workers: config.workers,
             seed,
         })
@@ -184,6 +189,7 @@ impl PatchSource {
                 draws.push(PatchDraw {
                     patch: variation.place(patch, (scene.height, scene.width), self.patch_size),
                     variation,
+                    dropped: self.dropout.draw(self.seed, epoch, position),
                 });
                 position += 1;
             }
@@ -214,8 +220,9 @@ impl PatchSource {
         for radiance in [&mut place.color, &mut place.reference] {
             radiance
                 .iter_mut()
-                .for_each(|value| *value *= variation.exposure);
+                .for_each(|value| *value *= variation.exposure * from.exposure_scale);
         }
+        drop_buffers(place.features, place.draw.dropped);
         let modulation = self.normalizer.modulation(place.features);
         self.normalizer
             .color_gamma_from_hdr(place.color, modulation.as_deref());

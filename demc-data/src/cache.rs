@@ -8,15 +8,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::dataset::size_mismatch;
 use crate::frame::{FramePlanes, Presence};
-use crate::position::{PositionSpace, map_planes};
-use crate::{ChannelLayout, Error, Scene};
+use crate::{ChannelLayout, Error, Preparation, Scene};
 
-/// The scenes of a training run, decoded on demand: colour, features and reference, no mask. The
-/// positions are in the run's [`PositionSpace`].
+/// The scenes of a training run, decoded on demand and prepared: colour, features and reference, no
+/// mask.
 pub struct SceneCache {
     scenes: Vec<Scene>,
     layout: ChannelLayout,
-    position: PositionSpace,
+    preparation: Preparation,
     budget: usize,
     turns: Vec<Mutex<()>>,
     kept: Mutex<CachedScenes>,
@@ -51,14 +50,14 @@ impl SceneCache {
     pub fn new(
         scenes: Vec<Scene>,
         layout: ChannelLayout,
-        position: PositionSpace,
+        preparation: Preparation,
         budget: usize,
     ) -> Self {
         let turns = scenes.iter().map(|_| Mutex::default()).collect();
         Self {
             scenes,
             layout,
-            position,
+            preparation,
             budget,
             turns,
             kept: Mutex::default(),
@@ -94,7 +93,7 @@ impl SceneCache {
         if let Some(error) = size_mismatch(scene, planes.width, planes.height) {
             return Err(error);
         }
-        map_planes(&mut planes.features, self.position);
+        planes.exposure_scale = self.preparation.apply(&mut planes);
         let planes = Arc::new(planes);
         lock(&self.kept).keep(index, &planes, self.budget);
         Ok(planes)

@@ -5,8 +5,10 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::augment::Augment;
+use crate::dropout::Dropout;
 use crate::patch::Border;
 use crate::position::PositionSpace;
+use crate::preparation::Preparation;
 
 /// The committed sample data, so that every configuration runs without an edit.
 const ROOT: &str = "data/sample";
@@ -32,6 +34,8 @@ const WORKERS: usize = 1;
 /// A smaller epsilon amplifies the colour of black surfaces; a larger one exceeds the albedo of
 /// white.
 const ALBEDO_EPSILONS: std::ops::RangeInclusive<f32> = 1e-3..=1.0;
+/// Eq. 5 has an epsilon of 0.001 for radiance of order 1; a level outside is a mistake.
+const EXPOSURE_LEVELS: std::ops::RangeInclusive<f32> = 1e-3..=10.0;
 /// Below 1, `y^gamma` and the loss have an infinite slope at black; a value above 6 is a mistake.
 const GAMMAS: std::ops::RangeInclusive<f32> = 1.0..=6.0;
 /// The network halves its input five times, so patch sizes are multiples of this (Fig. 3).
@@ -68,6 +72,13 @@ pub struct DataConfig {
     /// `"scene"`: positions as rendered, as in the paper; `"image"`: relative to the image
     /// ([`crate::PositionMap`]).
     pub position: PositionSpace,
+    /// Every image is scaled to this exposure ([`crate::ranges::exposure`]) before the network, and
+    /// back afterwards. From 0.001 to 10; absent: images keep their exposure, as in the paper.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub exposure_level: Option<f32>,
+    /// Probabilities that a patch lacks a feature buffer; 0 in the paper.
+    #[serde(skip_serializing_if = "Dropout::is_off")]
+    pub dropout: Dropout,
     /// Patches in a batch, at most 65536.
     pub batch_size: usize,
     /// Share of the training split's base scenes held out for validation, from 0 to below 1.
@@ -93,6 +104,8 @@ impl Default for DataConfig {
             gamma: GAMMA,
             albedo_demodulation_epsilon: None,
             position: PositionSpace::Scene,
+            exposure_level: None,
+            dropout: Dropout::default(),
             batch_size: BATCH_SIZE,
             validation: VALIDATION,
             augment: Augment::default(),
@@ -103,6 +116,14 @@ impl Default for DataConfig {
 }
 
 impl DataConfig {
+    /// What happens to a whole image before patches are cut from it.
+    pub fn preparation(&self) -> Preparation {
+        Preparation {
+            position: self.position,
+            exposure_level: self.exposure_level,
+        }
+    }
+
     /// Every value out of range, as `data.key = value: must be ...`; empty if all values are valid.
     pub fn validate(&self) -> Vec<String> {
         let mut problems = Vec::new();
@@ -131,6 +152,22 @@ impl DataConfig {
                 "albedo_demodulation_epsilon",
                 &epsilon,
                 "from 0.001 to 1; remove the key to switch demodulation off",
+            );
+        }
+        if let Some(level) = self.exposure_level {
+            require(
+                EXPOSURE_LEVELS.contains(&level),
+                "exposure_level",
+                &level,
+                "from 0.001 to 10; remove the key to keep each image's exposure",
+            );
+        }
+        for (key, probability) in self.dropout.probabilities() {
+            require(
+                (0.0..=1.0).contains(&probability),
+                key,
+                &probability,
+                "a probability from 0 to 1",
             );
         }
         require(

@@ -13,8 +13,8 @@ use crate::frame::{Presence, check_header};
 use crate::seed::{RandomStream, generator};
 use crate::{ChannelLayout, Error};
 
-/// The manifest format that this version reads.
-const FORMAT: &str = "demc-exr 1";
+/// The manifest format that this version reads and writes.
+pub const FORMAT: &str = "demc-exr 1";
 /// Maximum number of problems in one message; the others are counted.
 const PROBLEMS_LISTED: usize = 8;
 

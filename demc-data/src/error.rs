@@ -39,6 +39,9 @@ pub enum Error {
         b: String,
         b_window: String,
     },
+    /// Files that cannot be joined.
+    #[error("cannot merge: {0}")]
+    Merge(String),
     /// A buffer contains NaN or infinity.
     #[error(
         "{}: channel {channel}: {value} at x {x}, y {y} ({count} NaN or infinite samples in all)",

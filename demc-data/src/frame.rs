@@ -56,6 +56,8 @@ pub struct Frame {
     /// Share of a pixel's camera rays that hit a surface `[H, W]`, if the layout names it and the
     /// file has it.
     pub mask: Option<Vec<f32>>,
+    /// Alpha of the colour `[H, W]`, if the layout names it and the file has it.
+    pub alpha: Option<Vec<f32>>,
     /// Number of negative samples of colour and reference that were set to 0.
     pub clamped: usize,
 }
@@ -102,6 +104,18 @@ pub fn decode_repaired<R: Read + Seek>(
     Ok((frame_of(planes, file.path()), repaired))
 }
 
+/// Reads a frame with its reference. NaN, infinite, and negative samples are replaced as by
+/// [`decode_repaired`] if `repair` is set, and are otherwise an error.
+///
+/// # Errors
+/// As [`read_frame`]. A layout with a reference and a file without it do not fit.
+pub(crate) fn read_pair(path: &Path, layout: &ChannelLayout, repair: bool) -> Result<Frame, Error> {
+    let mut file = ExrFile::open(path)?.on_threads(1);
+    let (reference, mask) = (Presence::Required, Presence::IfPresent);
+    let planes = FramePlanes::decode_with(&mut file, layout, reference, mask, repair)?;
+    Ok(frame_of(planes.0, path))
+}
+
 fn decode<R: Read + Seek>(
     file: &mut ExrFile<R>,
     layout: &ChannelLayout,
@@ -125,6 +139,7 @@ fn frame_of(planes: FramePlanes, path: &Path) -> Frame {
         features: planar(&planes.features),
         reference: planes.reference.as_deref().map(planar),
         mask: planes.mask.as_ref().map(Plane::to_f32),
+        alpha: planes.alpha.as_ref().map(Plane::to_f32),
         clamped: planes.clamped,
     }
 }
@@ -144,11 +159,15 @@ pub struct FramePlanes {
     pub reference: Option<Vec<Plane>>,
     /// Share of the camera rays that hit a surface.
     pub mask: Option<Plane>,
+    /// Alpha of the colour.
+    pub alpha: Option<Plane>,
     /// Number of negative samples of colour and reference that were set to 0.
     pub clamped: usize,
+    /// Factor on colour and reference before the network ([`Preparation`](crate::Preparation)).
+    pub exposure_scale: f32,
 }
 
-/// Whether reference or mask is read.
+/// Whether reference, or mask and alpha are read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Presence {
     /// It is not read.
@@ -245,7 +264,9 @@ impl FramePlanes {
             features: take(&wanted.features)?,
             reference: wanted.reference.as_deref().map(&mut take).transpose()?,
             mask: take(&wanted.mask)?.pop(),
+            alpha: take(&wanted.alpha)?.pop(),
             clamped: 0,
+            exposure_scale: 1.0,
         };
         let radiance = planes
             .color
@@ -261,6 +282,7 @@ impl FramePlanes {
         radiance
             .chain(&self.features)
             .chain(&self.mask)
+            .chain(&self.alpha)
             .map(Plane::bytes)
             .sum()
     }
@@ -298,6 +320,7 @@ struct FrameChannels<'a> {
     features: Vec<Option<&'a str>>,
     reference: Option<Vec<Option<&'a str>>>,
     mask: Vec<Option<&'a str>>,
+    alpha: Vec<Option<&'a str>>,
 }
 
 impl<'a> FrameChannels<'a> {
@@ -336,15 +359,22 @@ impl<'a> FrameChannels<'a> {
             .reference
             .as_ref()
             .filter(|names| read(reference, &names[..]));
-        let mask = layout
-            .mask
-            .iter()
-            .filter(|name| read(mask, std::slice::from_ref(name)));
+        let single = |name: &'a Option<String>, presence| {
+            let names = name.iter();
+            let names = names.filter(move |name| read(presence, std::slice::from_ref(name)));
+            names.map(|name| Some(name.as_str())).collect()
+        };
+        // Files of renderers differ in whether they have an alpha channel.
+        let alpha = match mask {
+            Presence::Skip => Presence::Skip,
+            _ => Presence::IfPresent,
+        };
         let wanted = Self {
             color: slots(&layout.color),
             features,
             reference: reference.map(slots),
-            mask: mask.map(|name| Some(name.as_str())).collect(),
+            mask: single(&layout.mask, mask),
+            alpha: single(&layout.alpha, alpha),
         };
         file.require(&wanted.names())?;
         Ok(wanted)
@@ -356,6 +386,7 @@ impl<'a> FrameChannels<'a> {
         radiance_and_features
             .chain(self.reference.iter().flatten())
             .chain(&self.mask)
+            .chain(&self.alpha)
             .copied()
             .flatten()
             .collect()

@@ -31,7 +31,7 @@ pub use detect::{FileLayout, detect};
 pub const ANY_LAYER: &str = "*.";
 
 /// The built-in layouts: name and TOML text (`configs/renderers/`).
-pub const PRESETS: [(&str, &str); 5] = [
+pub const PRESETS: [(&str, &str); 6] = [
     (
         "demc-exr",
         include_str!("../../configs/renderers/demc-exr.toml"),
@@ -47,6 +47,10 @@ pub const PRESETS: [(&str, &str); 5] = [
     (
         "cycles",
         include_str!("../../configs/renderers/cycles.toml"),
+    ),
+    (
+        "luxcore",
+        include_str!("../../configs/renderers/luxcore.toml"),
     ),
     ("fbksd", include_str!("../../configs/renderers/fbksd.toml")),
 ];
@@ -79,6 +83,9 @@ pub struct ChannelLayout {
     /// without a hit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mask: Option<String>,
+    /// Alpha of the colour, 0 to 1, which is denoised with it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub alpha: Option<String>,
     /// Policies for missing feature buffers.
     #[serde(default)]
     pub missing: MissingPolicies,
@@ -207,7 +214,8 @@ impl ChannelLayout {
             .chain([&self.color])
             .chain(&self.reference)
             .flatten()
-            .chain(&self.mask);
+            .chain(&self.mask)
+            .chain(&self.alpha);
         for name in all {
             if !seen.insert(name) {
                 problems.push(format!("channel {name:?} is named twice"));

@@ -1,4 +1,4 @@
-//! `demc-data`: inspects images and data sets before training.
+//! `demc-data`: prepares and inspects images and data sets before training.
 
 mod cli;
 
@@ -11,7 +11,7 @@ fn main() -> ExitCode {
         Ok(status) => status,
         Err(error) => {
             cli::report(&error);
-            ExitCode::FAILURE
+            ExitCode::from(if error.is::<cli::UsageError>() { 2 } else { 1 })
         }
     }
 }

@@ -1,6 +1,8 @@
 //! One channel of an image in the precision of its file. Half planes stay half in the scene cache,
 //! which saves half the memory.
 
+use std::ops::Range;
+
 use half::f16;
 use half::slice::HalfFloatSliceExt;
 
@@ -58,6 +60,22 @@ impl Plane {
                 for (out, &sample) in out.iter_mut().zip(&samples[start..end]) {
                     *out = sample as f32;
                 }
+            }
+        }
+    }
+
+    /// Appends the samples of a range in their own type and the machine's byte order.
+    pub(crate) fn append_bytes(&self, range: Range<usize>, out: &mut Vec<u8>) {
+        match self {
+            Plane::Half(samples) => {
+                let bits = samples[range].iter().map(|sample| sample.to_bits());
+                out.extend(bits.flat_map(u16::to_ne_bytes));
+            }
+            Plane::Float(samples) => {
+                out.extend(samples[range].iter().flat_map(|s| s.to_ne_bytes()));
+            }
+            Plane::Uint(samples) => {
+                out.extend(samples[range].iter().flat_map(|s| s.to_ne_bytes()));
             }
         }
     }

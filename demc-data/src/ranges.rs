@@ -6,7 +6,7 @@ use crate::frame::{FEATURES, Frame, TEXTURES};
 use crate::moments::{ChannelMoments, hit_samples};
 
 /// Rec. 709 luminance of red, green and blue.
-const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
+pub(crate) const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
 /// Exponent of the mean that estimates an image's exposure. Dark pixels count; a firefly hardly
 /// does (ours).
 const EXPOSURE_GAMMA: f64 = 2.2;
@@ -161,6 +161,7 @@ mod tests {
             features: (0..12 * 8).map(|i| feature + (i % 2) as f32).collect(),
             reference: None,
             mask: None,
+            alpha: None,
             clamped: 0,
         }
     }

@@ -9,6 +9,7 @@ pub(crate) enum RandomStream {
     Validation = 1,
     Shuffle = 2,
     Augment = 3,
+    Dropout = 4,
 }
 
 pub(crate) fn generator(purpose: RandomStream, seed: u64, epoch: u64, position: u64) -> ChaCha8Rng {

@@ -7,7 +7,6 @@ use crate::frame::{FEATURES, FramePlanes, Presence, TEXTURES};
 use crate::moments::{ChannelMoments, hit_samples};
 use crate::parallel;
 use crate::plane::Plane;
-use crate::position::map_planes;
 use crate::ranges::{FrameSummary, Ranges};
 use crate::transform::STD_FLOOR;
 use crate::{ChannelLayout, DataConfig, Error, FeatureStats, Normalizer, Scene};
@@ -62,6 +61,7 @@ impl Statistics {
             gamma,
             albedo_demodulation_epsilon,
             position,
+            exposure_level,
             ..
         } = *config;
         let relmse_epsilon = decimal(relmse_epsilon);
@@ -78,6 +78,7 @@ impl Statistics {
                 gamma,
                 albedo_demodulation_epsilon,
                 position,
+                exposure_level,
                 features: FeatureStats {
                     mean: total.features.map(|moments| moments.mean as f32),
                     std: total
@@ -119,7 +120,7 @@ impl SceneSums {
         if let Some(error) = size_mismatch(scene, planes.width, planes.height) {
             return Err(error);
         }
-        map_planes(&mut planes.features, config.position);
+        let scale = config.preparation().apply(&mut planes);
         let albedo_epsilon = config.albedo_demodulation_epsilon;
         let pixels = planes.width * planes.height;
         let mask = planes.mask.as_ref().map(Plane::to_f32);
@@ -139,7 +140,7 @@ impl SceneSums {
         let textures = &planes.features[TEXTURES..];
         let references = planes.reference.iter().flatten();
         for ((color, plane), texture) in sums.color.iter_mut().zip(references).zip(textures) {
-            let scale = match albedo_epsilon {
+            let modulation = match albedo_epsilon {
                 Some(epsilon) => texture
                     .to_f32()
                     .iter()
@@ -147,7 +148,8 @@ impl SceneSums {
                     .collect(),
                 None => vec![1.0; pixels],
             };
-            *color = FlatColor::of(&plane.to_f32(), &scale, relmse_epsilon);
+            let samples: Vec<f32> = plane.to_f32().iter().map(|x| x * scale).collect();
+            *color = FlatColor::of(&samples, &modulation, relmse_epsilon);
         }
         Ok(sums)
     }

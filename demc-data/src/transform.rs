@@ -16,6 +16,9 @@ pub const MAX_ALBEDO: f32 = 1.0;
 /// so smaller deviations of normals or textures are rounding.
 pub const STD_FLOOR: f32 = 1e-3;
 
+/// Largest factor on the colour, and the inverse of the smallest.
+pub const MAX_INPUT_SCALE: f32 = 1e6;
+
 /// Mean and standard deviation of each feature channel over the training scenes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -44,6 +47,10 @@ pub struct Normalizer {
     /// What the origin and the unit of positions are.
     #[serde(default, skip_serializing_if = "PositionSpace::is_scene")]
     pub position: PositionSpace,
+    /// The [exposure](crate::ranges::exposure) that every image is scaled to before the network; the
+    /// output is scaled back. `None`: images keep theirs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub exposure_level: Option<f32>,
     /// Mean and standard deviation for the Z-score.
     pub features: FeatureStats,
     /// The flat output with the least RelMSE (Eq. 5) against the training references, in gamma
@@ -157,6 +164,16 @@ impl Normalizer {
     }
 }
 
+/// The factor that brings an image of this exposure to `level`; 1 for a black image.
+pub fn exposure_scale(level: f32, exposure: f64) -> f32 {
+    let scale = f64::from(level) / exposure;
+    if !scale.is_finite() {
+        return 1.0;
+    }
+    let limit = f64::from(MAX_INPUT_SCALE);
+    scale.clamp(1.0 / limit, limit) as f32
+}
+
 /// Compresses linear radiance in place: `max(x, 0)^(1/gamma)` (Eq. 4).
 pub fn gamma_from_hdr(color: &mut [f32], gamma: f32) {
     let exponent = 1.0 / gamma;
@@ -178,6 +195,7 @@ mod tests {
             gamma: 2.2,
             albedo_demodulation_epsilon: None,
             position: PositionSpace::Scene,
+            exposure_level: None,
             features,
             flat_color: [0.4; 3],
         }

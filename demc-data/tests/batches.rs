@@ -6,13 +6,13 @@ use std::collections::HashSet;
 use std::fs;
 use std::sync::Arc;
 
-use demc_data::PositionSpace;
 use demc_data::cache::SceneCache;
 use demc_data::frame::TEXTURES;
 use demc_data::{
     Augment, Batch, BatchLoader, Border, DataConfig, Error, FEATURES, Normalizer, PatchSource,
     Scene, Statistics, read_frame,
 };
+use demc_data::{PositionSpace, Preparation};
 use support::batches::{small, source, train_scenes};
 use support::{identity, layout, scene_channels, write};
 
@@ -151,7 +151,7 @@ fn a_demodulated_batch_times_its_modulation_is_the_plain_one() {
 #[test]
 fn the_cache_stays_in_its_budget_and_decodes_again() {
     let scenes = train_scenes();
-    let all = SceneCache::new(scenes.clone(), layout(), PositionSpace::Scene, usize::MAX);
+    let all = SceneCache::new(scenes.clone(), layout(), Preparation::default(), usize::MAX);
     for index in 0..scenes.len() {
         all.get(index).expect("the sample is sound");
     }
@@ -166,7 +166,7 @@ fn the_cache_stays_in_its_budget_and_decodes_again() {
     );
 
     let budget = whole.bytes / 3;
-    let cache = SceneCache::new(scenes.clone(), layout(), PositionSpace::Scene, budget);
+    let cache = SceneCache::new(scenes.clone(), layout(), Preparation::default(), budget);
     for turn in 0..30 {
         let index = turn * 7 % 10;
         assert_eq!(
@@ -183,7 +183,7 @@ fn the_cache_stays_in_its_budget_and_decodes_again() {
     cache.get(29 * 7 % 10).expect("sound");
     assert_eq!(cache.usage().decoded, 30, "the most recent is kept");
 
-    let none = SceneCache::new(scenes, layout(), PositionSpace::Scene, 0);
+    let none = SceneCache::new(scenes, layout(), Preparation::default(), 0);
     none.get(0).expect("sound");
     assert_eq!((none.usage().scenes, none.usage().bytes), (0, 0));
 }
@@ -203,7 +203,7 @@ fn batches_do_not_depend_on_the_cache() {
 
 #[test]
 fn threads_that_want_one_scene_decode_it_once() {
-    let cache = SceneCache::new(train_scenes(), layout(), PositionSpace::Scene, usize::MAX);
+    let cache = SceneCache::new(train_scenes(), layout(), Preparation::default(), usize::MAX);
     std::thread::scope(|scope| {
         for _ in 0..8 {
             scope.spawn(|| cache.get(3).expect("the sample is sound"));

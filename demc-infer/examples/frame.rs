@@ -81,6 +81,7 @@ fn render() -> Frame {
         features,
         reference: None,
         mask: None,
+        alpha: None,
         clamped: 0,
     }
 }

@@ -26,6 +26,7 @@
 //!     features,
 //!     reference: None,
 //!     mask: None,
+//!     alpha: None,
 //!     clamped: 0,
 //! };
 //!

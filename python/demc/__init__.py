@@ -1,10 +1,43 @@
-"""The DEMC Monte Carlo denoiser (Yang et al. 2019) in PyTorch.
+"""The DEMC Monte Carlo denoiser (Yang et al. 2019) in PyTorch, and a reader of renderers' EXR files.
 
-It loads and runs the weights that `demc-infer export` writes.
+It loads and runs the weights that `demc-infer export` writes. Names are imported at first use:
+`read_exr`, `Frame`, and `preprocess` need NumPy and OpenEXR only, the others PyTorch.
 """
 
-from .bundle import Bundle, load
-from .metrics import gamma_from_hdr, hdr_from_gamma, rel_mse
-from .network import Denoiser, ModelConfig
+from importlib import import_module
+from typing import TYPE_CHECKING
 
-__all__ = ["Bundle", "Denoiser", "ModelConfig", "gamma_from_hdr", "hdr_from_gamma", "load", "rel_mse"]
+if TYPE_CHECKING:
+    from .bundle import Bundle, load
+    from .exr import Frame, read_exr
+    from .metrics import gamma_from_hdr, hdr_from_gamma, rel_mse
+    from .network import Denoiser, ModelConfig
+
+_MODULES = {
+    "bundle": ["Bundle", "load"],
+    "exr": ["Frame", "read_exr"],
+    "layouts": [],
+    "metrics": ["gamma_from_hdr", "hdr_from_gamma", "rel_mse"],
+    "network": ["Denoiser", "ModelConfig"],
+    "preprocess": [],
+}
+
+__all__ = [
+    "Bundle",
+    "Denoiser",
+    "Frame",
+    "ModelConfig",
+    "gamma_from_hdr",
+    "hdr_from_gamma",
+    "load",
+    "read_exr",
+    "rel_mse",
+]
+
+
+def __getattr__(name: str) -> object:
+    for module, names in _MODULES.items():
+        if name == module or name in names:
+            imported = import_module(f".{module}", __name__)
+            return imported if name == module else getattr(imported, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

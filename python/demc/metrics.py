@@ -2,8 +2,8 @@
 
 from torch import Tensor
 
-GAMMA = 2.2
-"""Exponent of the colour compression (Eq. 4)."""
+from .preprocess import GAMMA
+
 EPSILON = 0.001
 """Keeps RelMSE finite where the reference is black (Eq. 5)."""
 

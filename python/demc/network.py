@@ -17,10 +17,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-FEATURES = 12
-"""Normal xyz, world position xyz, albedo RGB (first hit), albedo RGB (second hit) (Sec. 3.1)."""
-SIZE_MULTIPLE = 32
-"""Heights and widths must be multiples of this: five max-pools of 2."""
+from .preprocess import FEATURES, SIZE_MULTIPLE
+
 LEVEL_FACTORS = (1, 2, 4, 8, 8)
 """The paper's channels of the levels, in units of the base width (Fig. 3)."""
 BN_EPSILON = 1e-3

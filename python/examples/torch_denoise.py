@@ -1,25 +1,25 @@
-"""Denoises an image in PyTorch with a bundle of `demc-infer export`: MODEL.safetensors IN.exr OUT.exr
+"""Denoises an EXR file of any renderer in PyTorch with a bundle of `demc-infer export`.
 
-pip install ./python OpenEXR (in the repository root)
+pip install ./python (in the repository root)
 """
 
+import argparse
 import sys
 
 import demc
-import numpy as np
-import OpenEXR
 
-model, source, target = sys.argv[1:]
-bundle = demc.load(model)
-layout = bundle.meta["layout"]
-channels = OpenEXR.File(source, separate_channels=True).channels()
+parser = argparse.ArgumentParser(description=__doc__)
+for name in ("model", "input", "output"):
+    parser.add_argument(name)
+parser.add_argument("--layout", help="preset or TOML file of the channels; default: the one that fits")
+parser.add_argument("--layer", help="view layer, for a file with several")
+arguments = parser.parse_args()
 
-
-def planes(*buffers):
-    """Buffers of the layout, [C, H, W]."""
-    return np.stack([channels[name].pixels for buffer in buffers for name in layout[buffer]])
-
-
-image = bundle.denoise(planes("color"), planes("normal", "position", "texture1", "texture2"))
-header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-OpenEXR.File(header, {"RGB": np.ascontiguousarray(image.transpose(1, 2, 0))}).write(target)
+try:
+    bundle = demc.load(arguments.model)
+    frame = demc.read_exr(arguments.input, arguments.layout, arguments.layer, bundle)
+    print(frame.layout.describe())
+    image = bundle.denoise(frame.color, frame.features)
+    frame.write(arguments.output, image, precision="float")
+except (OSError, ValueError) as error:
+    sys.exit(f"error: {error}")

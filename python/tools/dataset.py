@@ -2,30 +2,51 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 
+# The package of this checkout: its reader needs neither an installation nor PyTorch.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-class Scene:
-    """The channels of an EXR file, and the scene's entry in its header."""
+from demc.exr import Frame, write_whole
 
-    def __init__(self, path: Path) -> None:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            self.channels = {name: channel.pixels for name, channel in file.channels().items()}
-            self.about = {key: value for key, value in file.header().items() if key == "demc"}
-        self.path = path
 
-    def rgb(self, prefix: str, names: str = "RGB") -> np.ndarray:
-        """Three channels as float32 [H, W, 3]."""
-        wanted = [prefix + name for name in names]
-        missing = [name for name in wanted if name not in self.channels]
-        if missing:
-            raise ValueError(f"{self.path}: no channel {', '.join(missing)}")
-        return np.ascontiguousarray(np.stack([self.channels[name] for name in wanted], -1), np.float32)
+def add_layout_flags(parser: argparse.ArgumentParser) -> None:
+    """`--layout` and `--layer`, as in `demc-infer`."""
+    parser.add_argument(
+        "--layout",
+        metavar="PRESET|FILE",
+        help="channel layout: demc-exr, mitsuba3, pbrt-v4, cycles, fbksd, or a TOML file; default: per file, the preset that fits",
+    )
+    parser.add_argument("--layer", metavar="NAME", help="view layer, for files with several")
+
+
+def pixels(planes: np.ndarray) -> np.ndarray:
+    """[C, H, W] -> [H, W, C]."""
+    return np.ascontiguousarray(planes.transpose(1, 2, 0))
+
+
+def albedo(frame: Frame) -> np.ndarray:
+    """Albedo (first hit) [H, W, 3]."""
+    return pixels(frame.features[6:9])
+
+
+def normal(frame: Frame) -> np.ndarray:
+    """Normal [H, W, 3]."""
+    return pixels(frame.features[:3])
+
+
+def reference(frame: Frame) -> np.ndarray:
+    """Reference [H, W, 3]. Raises ValueError for a file without."""
+    if frame.reference is None:
+        raise ValueError(f"{frame.file.path}: no reference channels of layout {frame.layout.name}")
+    return pixels(frame.reference)
 
 
 def manifest(data: Path) -> dict:
@@ -40,18 +61,9 @@ def scenes(data: Path, split: str) -> list[Path]:
     return found
 
 
-def as_kind(plane: np.ndarray, kind: np.dtype) -> np.ndarray:
-    """The plane in another float type; too large values become the largest finite one."""
-    limit = np.finfo(kind)
-    return np.ascontiguousarray(plane.clip(limit.min, limit.max).astype(kind))
-
-
-def write(path: Path, channels: dict[str, np.ndarray], about: dict[str, str] | None = None) -> None:
+def write(path: Path, channels: dict[str, np.ndarray]) -> None:
     """Writes an EXR file completely or not at all."""
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | (about or {})
-    unfinished = path.with_name(f".{path.stem}.unfinished.exr")
-    OpenEXR.File(header, channels).write(str(unfinished))
-    os.replace(unfinished, path)
+    write_whole(path, OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels))
 
 
 def write_manifest(data: Path, manifest: dict) -> None:

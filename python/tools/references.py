@@ -7,12 +7,13 @@
 Use it for references of some hundred samples per pixel, which have visible noise
 (docs/experiments.md has its effect).
 
+- The channels are found as `demc-infer` finds them, per file (docs/data.md#channel-layouts).
 - Its guides are albedo and normal, both denoised first. They come from the reference's own samples
-  if the file has them (`ref.albedo1.R`, `ref.normal.X`, ...; python/render writes them), otherwise
-  from the noisy image.
+  if the file has them, otherwise from the noisy image. Their names are `ref.` and the name of the
+  noisy channel (`ref.albedo1.R`, `ref.normal.X`, ...; python/render writes them).
 - A pixel gets at most as bright as the noise of its samples allows. This keeps black slats in front
   of a window black.
-- All other channels are copied. Scenes of the test split are listed, not copied.
+- All other channels and attributes are copied. Scenes of the test split are listed, not copied.
 - Existing files are kept unless their source is newer.
 - `ref_denoised` in the manifest marks the denoised references.
 """
@@ -25,7 +26,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from dataset import Scene, as_kind, manifest, write, write_manifest
+from dataset import add_layout_flags, albedo, manifest, normal, pixels, reference, write_manifest
+from demc.exr import Frame, read_exr
 from oidn import with_prefilter
 
 LIGHTER = 3.0
@@ -50,10 +52,10 @@ def clean(reference: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.n
     return np.minimum(with_prefilter(samples, albedo, normal), most)
 
 
-def guide(scene: Scene, prefix: str, names: str) -> np.ndarray:
-    """A feature of the reference's own samples if the file has it, otherwise of the noisy image."""
-    of_reference = f"ref.{prefix}{names[0]}" in scene.channels
-    return scene.rgb(f"ref.{prefix}" if of_reference else prefix, names)
+def guide(frame: Frame, buffer: str, noisy: np.ndarray) -> np.ndarray:
+    """A feature of the reference's own samples if the file has it, otherwise `noisy`."""
+    names = [f"ref.{name}" for name in frame.layout.channels.get(buffer, ())]
+    return pixels(frame.file.planes(names)) if names and names[0] in frame.file.channels else noisy
 
 
 def noise(plane: np.ndarray) -> np.ndarray:
@@ -79,21 +81,22 @@ def stale(target: Path, source: Path) -> bool:
     return not target.exists() or target.stat().st_mtime < source.stat().st_mtime
 
 
-def rewrite(source: Path, target: Path) -> None:
-    scene = Scene(source)
-    cleaned = clean(scene.rgb("ref."), guide(scene, "albedo1.", "RGB"), guide(scene, "normal.", "XYZ"))
+def rewrite(source: Path, target: Path, layout: str | None, layer: str | None) -> None:
+    frame = read_exr(source, layout, layer)
+    cleaned = clean(
+        reference(frame), guide(frame, "texture1", albedo(frame)), guide(frame, "normal", normal(frame))
+    )
     if not np.isfinite(cleaned).all():
         raise ValueError(f"{source}: the denoised reference contains NaN or infinite values")
-    for i, name in enumerate("RGB"):
-        scene.channels["ref." + name] = as_kind(cleaned[..., i], scene.channels["ref." + name].dtype)
     target.parent.mkdir(parents=True, exist_ok=True)
-    write(target, scene.channels, scene.about)
+    frame.file.write(target, dict(zip(frame.layout.channels["reference"], cleaned.transpose(2, 0, 1))))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="directory with manifest.json")
     parser.add_argument("-o", "--output", type=Path, required=True, help="directory of the new data set, created if missing")
+    add_layout_flags(parser)
     arguments = parser.parse_args()
     data, output = arguments.data, arguments.output
     try:
@@ -108,7 +111,7 @@ def main() -> int:
                 scene |= {"file": f"train/{scene['name']}.exr", "ref_denoised": "Open Image Denoise"}
                 scene.pop("ref_residual_relmse", None)
                 if stale(output / scene["file"], source):
-                    rewrite(source, output / scene["file"])
+                    rewrite(source, output / scene["file"], arguments.layout, arguments.layer)
                     denoised += 1
             else:
                 scene["file"] = os.path.relpath(source.resolve(), output.resolve())

@@ -171,6 +171,7 @@ fn frames([batch, height, width]: [usize; 3], bundle: &Bundle, rng: &mut ChaCha8
             features,
             reference: None,
             mask: None,
+            alpha: None,
             clamped: 0,
         }
     };

@@ -1,8 +1,13 @@
 //! The command line: arguments and dispatch.
 
+mod doctor;
+mod index;
 mod inspect;
+mod merge;
 mod stats;
 
+use std::ffi::OsString;
+use std::fmt;
 use std::io::{ErrorKind, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -11,7 +16,7 @@ use anyhow::{Context, Result};
 use clap::{Args, Parser, Subcommand};
 use demc_data::Split;
 
-/// Inspects images and data sets for training a DEMC denoiser.
+/// Prepares and inspects images and data sets for training a DEMC denoiser.
 ///
 /// Exit status: 0 success, 1 a file or data set cannot be used, 2 wrong arguments.
 #[derive(Parser)]
@@ -36,6 +41,24 @@ enum DataCommand {
     /// and position exclude misses (`mask.A` = 0). The command checks every file's header and reads
     /// the split's files completely.
     Stats(StatsArguments),
+    /// Join the channels of several OpenEXR files in one file.
+    ///
+    /// `FILE` keeps its channel names; `NAME=FILE` puts `NAME.` before each of them. Samples keep
+    /// their types and bits. Attributes of later files are added if the earlier ones lack them. All
+    /// files must have one size and data window.
+    Merge(MergeArguments),
+    /// Write the manifest.json of a directory of scenes.
+    ///
+    /// Each OpenEXR file in the directory and below becomes a scene; other files, hidden files, and
+    /// linked directories are ignored and counted. Sizes come from the headers. Every file must fit one
+    /// layout and have a reference. A base scene must not be in both splits.
+    Index(IndexArguments),
+    /// Look for mistakes in a data set that training would not report.
+    ///
+    /// It checks the manifest, exposures, the pixel filter, references, duplicates, and features, and
+    /// prints one line per problem: the scenes concerned, what was measured, and the likely cause.
+    /// The exit status is 1 if there are problems.
+    Doctor(DoctorArguments),
 }
 
 #[derive(Args)]
@@ -57,7 +80,7 @@ struct StatsArguments {
     /// Directory of the data set, with its manifest.json
     #[arg(value_name = "DIR")]
     root: PathBuf,
-    /// Channel layout: demc-exr, mitsuba3, pbrt-v4, cycles, fbksd, or a TOML file
+    /// Channel layout: demc-exr, mitsuba3, pbrt-v4, cycles, luxcore, fbksd, or a TOML file
     #[arg(long, default_value = "demc-exr")]
     layout: String,
     /// The split to measure
@@ -66,6 +89,62 @@ struct StatsArguments {
     /// Print one JSON object instead of a table
     #[arg(long)]
     json: bool,
+}
+
+#[derive(Args)]
+#[command(
+    after_help = "Example:\n  demc-data merge -o scene.exr noisy.exr albedo=noisy.albedo.exr ref=reference.exr"
+)]
+struct MergeArguments {
+    /// The file to write
+    #[arg(short, long, value_name = "OUT.exr")]
+    output: PathBuf,
+    /// Files to join; a path with `=` in its first directory or name is written as `./PATH`
+    #[arg(required = true, value_name = "[NAME=]FILE")]
+    files: Vec<OsString>,
+    /// Replace an existing output
+    #[arg(long)]
+    overwrite: bool,
+}
+
+#[derive(Args)]
+#[command(after_help = "Example:\n  demc-data doctor data/sample")]
+struct DoctorArguments {
+    /// Directory of the data set, with its manifest.json
+    #[arg(value_name = "DIR")]
+    root: PathBuf,
+    /// Channel layout: a preset or a TOML file; by default the preset that fits the first file
+    #[arg(long, value_name = "PRESET|FILE")]
+    layout: Option<String>,
+    /// Patch size of training in pixels
+    #[arg(long, default_value_t = 128, value_name = "PIXELS")]
+    patch_size: usize,
+    /// Print one JSON object instead of lines
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Args)]
+#[command(
+    after_help = "Examples:\n  demc-data index renders --test 'kitchen*'\n  demc-data index renders --test 'bath/*' --base '^([^/]+)/'"
+)]
+struct IndexArguments {
+    /// Directory of the scenes
+    #[arg(value_name = "DIR")]
+    root: PathBuf,
+    /// Glob pattern of the test scenes: relative paths or file names (repeatable)
+    #[arg(long, value_name = "PATTERN")]
+    test: Vec<String>,
+    /// Regular expression whose only group is the base scene, searched in the relative path without
+    /// extension; by default the file name without the number at its end
+    #[arg(long, value_name = "REGEX")]
+    base: Option<String>,
+    /// Channel layout: a preset or a TOML file; by default the preset that fits each file
+    #[arg(long, value_name = "PRESET|FILE")]
+    layout: Option<String>,
+    /// Replace an existing manifest; keys of its scenes that this command does not set stay
+    #[arg(long)]
+    overwrite: bool,
 }
 
 impl Cli {
@@ -79,13 +158,39 @@ impl Cli {
             DataCommand::Inspect(args) => inspect::run(&args.files, args.json),
             DataCommand::Stats(args) => stats::run(&args.root, &args.layout, args.split, args.json)
                 .map(|()| ExitCode::SUCCESS),
+            DataCommand::Doctor(args) => doctor::run(
+                &args.root,
+                args.layout.as_deref(),
+                args.patch_size,
+                args.json,
+            ),
+            DataCommand::Index(args) => index::run(&args).map(|()| ExitCode::SUCCESS),
+            DataCommand::Merge(args) => merge::run(&args.output, &args.files, args.overwrite)
+                .map(|()| ExitCode::SUCCESS),
         }
     }
 }
 
+/// Arguments that contradict each other or the files on disk.
+#[derive(Debug)]
+pub struct UsageError(String);
+
+impl fmt::Display for UsageError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for UsageError {}
+
+/// Text from a file or an argument, safe to print in one line.
+fn printable(text: &str) -> String {
+    text.replace(char::is_control, "\u{fffd}")
+}
+
 /// Prints an error as one line on standard error.
 pub fn report(error: &anyhow::Error) {
-    eprintln!("error: {error:#}");
+    eprintln!("{}", printable(&format!("error: {error:#}")));
 }
 
 fn parse_split(text: &str) -> Result<Split, String> {

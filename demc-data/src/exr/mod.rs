@@ -5,6 +5,7 @@
 //! in a file of several parts, and the channel's own name (including dots) in a file of one part.
 //!
 //! [`write_rgb`] writes only three channels. [`rewrite`] copies a file with a different colour.
+//! [`merge`] joins the channels of several files.
 //!
 //! # Supported files
 //!
@@ -21,6 +22,7 @@
 mod blocks;
 mod compression;
 mod decode;
+pub mod merge;
 mod plan;
 mod read;
 mod recode;

@@ -148,8 +148,12 @@ fn color_channels<'a, R: Read + Seek>(
 ) -> Result<Vec<&'a Channel>, Error> {
     file.require(&layout.color.each_ref().map(String::as_str))?;
     let names = layout.color.iter();
-    let channels: Vec<&Channel> = names.filter_map(|name| file.channel(name)).collect();
+    let mut channels: Vec<&Channel> = names.filter_map(|name| file.channel(name)).collect();
     let (first, window) = (channels[0], channels[0].window);
+    if samples == 4 * window.width * window.height {
+        let alpha = layout.alpha.iter();
+        channels.extend(alpha.filter_map(|name| file.channel(name)));
+    }
     if let Some(other) = channels.iter().find(|channel| channel.window != window) {
         return Err(Error::Sizes {
             path: file.path().to_owned(),
@@ -159,7 +163,7 @@ fn color_channels<'a, R: Read + Seek>(
             b_window: other.window.to_string(),
         });
     }
-    if 3 * window.width * window.height != samples {
+    if channels.len() * window.width * window.height != samples {
         let detail = format!("{samples} samples of colour do not match {window}, its current size");
         return Err(undecodable(file.path(), detail));
     }

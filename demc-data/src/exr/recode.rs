@@ -145,14 +145,14 @@ impl<R: Read + Seek> Recoder<'_, R> {
     }
 }
 
-struct OutputBlock {
-    index: usize,
+pub(super) struct OutputBlock {
+    pub(super) index: usize,
     tile: TileCoordinates,
-    corner: Vec2<usize>,
-    size: Vec2<usize>,
+    pub(super) corner: Vec2<usize>,
+    pub(super) size: Vec2<usize>,
 }
 
-fn targets(header: &Header) -> Result<Vec<OutputBlock>, ExrError> {
+pub(super) fn targets(header: &Header) -> Result<Vec<OutputBlock>, ExrError> {
     let blocks = header.enumerate_ordered_blocks();
     let targets = blocks.map(|(index, tile)| {
         let area = header.get_absolute_block_pixel_coordinates(tile.location)?;
@@ -196,7 +196,7 @@ fn assemble(
     (data, clamped)
 }
 
-fn compress(
+pub(super) fn compress(
     part: usize,
     header: &Header,
     target: &OutputBlock,
@@ -300,7 +300,7 @@ fn put(line: &[f32], kind: SampleType, data: &mut Vec<u8>) -> usize {
 /// Writes the headers of a finished file again, with attributes sorted by name, as OpenEXR's own
 /// library does. The `exr` crate writes unknown attributes in the random order of a hash map, so
 /// equal images would give different bytes. The length does not change.
-fn sort_attributes<W: Write + Seek>(writer: &mut W, headers: &Headers) -> Result<(), ExrError> {
+pub(super) fn sort_attributes<W: Write + Seek>(writer: &mut W, headers: &Headers) -> Result<(), ExrError> {
     writer.seek(SeekFrom::Start(HEADERS_START))?;
     for header in headers {
         writer.write_all(&sorted(header)?)?;

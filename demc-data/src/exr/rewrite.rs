@@ -47,11 +47,12 @@ pub fn write_denoised(
     )
 }
 
-/// Copies a file with the denoised colour in place of the layout's colour channels. The output is
+/// Copies a file with the denoised colour, and alpha if given, in place of the layout's channels. The output is
 /// complete or absent.
 ///
 /// # Shapes
-/// `color_hdr` is `[3, height, width]` of the colour's window, linear radiance.
+/// `color_hdr` is `[3, height, width]` of the colour's window, linear radiance, or
+/// `[4, height, width]` with the layout's alpha.
 ///
 /// # Errors
 /// [`Error::Read`], [`Error::Exr`] and [`Error::MissingChannels`] for the input, as

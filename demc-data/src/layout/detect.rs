@@ -86,7 +86,7 @@ impl ChannelLayout {
         ];
         let triples = features.into_iter().chain([&mut self.reference]).flatten();
         let triples = triples.chain([&mut self.color]).flatten();
-        triples.chain(&mut self.mask)
+        triples.chain(&mut self.mask).chain(&mut self.alpha)
     }
 
     fn has_any_layer(&self) -> bool {

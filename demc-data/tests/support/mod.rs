@@ -31,6 +31,7 @@ pub fn identity() -> Normalizer {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
         position: PositionSpace::Scene,
+        exposure_level: None,
         features,
         flat_color: [0.4; 3],
     }

@@ -24,6 +24,7 @@ pub(crate) fn bundle(variant: Variant) -> Bundle {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
         position: PositionSpace::Scene,
+        exposure_level: None,
         features,
         flat_color: [0.4, 0.3, 0.2],
     };
@@ -48,6 +49,7 @@ pub(crate) fn frame(width: usize, height: usize) -> Frame {
         features: pattern(FEATURES),
         reference: None,
         mask: None,
+        alpha: None,
         clamped: 0,
     }
 }

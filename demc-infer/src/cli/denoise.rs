@@ -223,7 +223,9 @@ impl Arguments {
                 .write_png(&path)
                 .with_context(|| format!("cannot write {}", path.display()))?;
         }
-        for note in self.output_flags.write(&mut file, job, layout, image)? {
+        let mut planes = denoised.color_hdr;
+        planes.extend(denoised.alpha.into_iter().flatten());
+        for note in self.output_flags.write(&mut file, job, layout, &planes)? {
             progress.line(format_args!("note: {name}: {note}"));
         }
         Ok(frame.clamped)

@@ -14,7 +14,7 @@ use super::UsageError;
 /// `--layout`, `--layer`.
 #[derive(Args)]
 pub struct LayoutFlags {
-    /// Channel layout of the images: demc-exr, mitsuba3, pbrt-v4, cycles, fbksd, or a TOML file
+    /// Channel layout of the images: demc-exr, mitsuba3, pbrt-v4, cycles, luxcore, fbksd, or a TOML file
     /// [default: the model's own if it fits, otherwise the preset that fits]
     #[arg(long, value_name = "PRESET|FILE")]
     layout: Option<String>,

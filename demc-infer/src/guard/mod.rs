@@ -6,21 +6,19 @@
 //!   reference, because the noisy input is unbiased.
 //!
 //! A renderer that writes a wrong buffer causes no error: normals in camera space, normals packed
-//! into 0 to 1, swapped buffers. Known mistakes are tested first (`geometry`).
+//! into 0 to 1, swapped buffers. Known mistakes are tested first ([`demc_data::geometry`]).
 //! The other channels are compared with the ranges of the training scenes (`drift`).
 
 mod drift;
 mod energy;
-mod geometry;
-
-use std::fmt;
 
 use demc_data::frame::{FEATURE_NAMES, POSITIONS, TEXTURES};
-use demc_data::{Frame, FrameSummary};
+use demc_data::{Frame, FrameSummary, geometry};
 
 use crate::Bundle;
 use crate::error::{DenoiseError, check_sizes};
 
+pub use demc_data::geometry::Warning;
 pub use energy::EnergyBias;
 
 /// Largest distance of a feature channel from the training mean, in training deviations: the root
@@ -35,24 +33,6 @@ pub const FARTHEST_RMS: f64 = 100.0;
 /// Number of channels whose missed pixels are left out, as in the statistics: normal xyz and
 /// position xyz.
 const GEOMETRY: usize = 6;
-
-/// One sign that an image differs from the training data.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Warning {
-    /// The buffer or channel.
-    pub what: String,
-    /// The measured values.
-    pub found: String,
-    /// The likely cause.
-    pub cause: &'static str,
-}
-
-impl fmt::Display for Warning {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { what, found, cause } = self;
-        write!(f, "{what}: {found}; {cause}")
-    }
-}
 
 impl Bundle {
     /// Lists how `frame` differs from the training data. The list is empty for an image like the

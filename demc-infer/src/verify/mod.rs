@@ -277,6 +277,7 @@ fn synthetic_frame(
         features,
         reference: None,
         mask: None,
+        alpha: None,
         clamped: 0,
     }
 }

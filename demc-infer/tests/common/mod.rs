@@ -35,6 +35,7 @@ pub fn random_bundle() -> Bundle {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
         position: PositionSpace::Scene,
+        exposure_level: None,
         features: FeatureStats {
             mean: [0.2; 12],
             std: [0.7; 12],

@@ -2,8 +2,8 @@
 
 use anyhow::Context;
 use demc_data::{
-    ChannelLayout, DataConfig, Dataset, Normalizer, PatchSource, Ranges, Scene, Split, Statistics,
-    read_frame,
+    ChannelLayout, DataConfig, Dataset, Dropout, Normalizer, PatchSource, Ranges, Scene, Split,
+    Statistics, read_frame,
 };
 use demc_infer::bundle::BundleMeta;
 use demc_model::ModelConfig;
@@ -25,6 +25,8 @@ pub struct RunData {
     pub normalizer: Normalizer,
     /// Ranges of [`Self::train`], and of the scenes that initial weights were trained on.
     pub ranges: Ranges,
+    /// Which buffers training drops, so that files may lack them.
+    pub dropout: Dropout,
     /// Number of negative values of colour and reference, which are clamped to 0.
     pub clamped: u64,
 }
@@ -74,6 +76,7 @@ impl RunData {
                 true => statistics.ranges.in_any_axes(),
                 false => statistics.ranges,
             },
+            dropout: config.data.dropout,
             clamped,
         })
     }
@@ -94,7 +97,9 @@ impl RunData {
 
     /// The description of weights that are trained on this data, at `step`.
     pub fn meta(&self, model: ModelConfig, step: u64) -> BundleMeta {
-        BundleMeta::new(model, self.normalizer.clone(), self.layout.clone(), step)
+        let mut layout = self.layout.clone();
+        layout.missing = layout.missing.or(self.dropout.missing());
+        BundleMeta::new(model, self.normalizer.clone(), layout, step)
             .with_ranges(self.ranges.clone())
     }
 

@@ -7,10 +7,10 @@
 //! Each test takes a median or a share over a regular grid of pixels that hit a surface. All 108
 //! scenes of the data set pass; the scene closest to each limit is named beside it.
 
-use demc_data::Frame;
-use demc_data::frame::POSITIONS;
+use std::fmt;
 
-use super::Warning;
+use crate::Frame;
+use crate::frame::POSITIONS;
 
 /// Largest number of tested pixels.
 const MAX_SAMPLES: usize = 1 << 16;
@@ -36,7 +36,30 @@ const TEXTURE1: usize = 6;
 
 type Vector = [f32; 3];
 
-pub(super) fn warnings(frame: &Frame) -> Vec<Warning> {
+/// One sign that an image differs from the training data.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Warning {
+    /// The buffer or channel.
+    pub what: String,
+    /// The measured values.
+    pub found: String,
+    /// The likely cause.
+    pub cause: &'static str,
+}
+
+impl fmt::Display for Warning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { what, found, cause } = self;
+        write!(f, "{what}: {found}; {cause}")
+    }
+}
+
+/// Signs of swapped, packed and rotated buffers. The list is empty if fewer than 64 tested pixels hit
+/// a surface.
+///
+/// # Panics
+/// If a buffer of the frame does not have its size.
+pub fn warnings(frame: &Frame) -> Vec<Warning> {
     let hits = SurfacePixels::of(frame);
     if hits.pixels.len() < MIN_SAMPLES {
         return Vec::new();
@@ -194,7 +217,7 @@ fn cross(a: Vector, b: Vector) -> Vector {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use demc_data::FEATURES;
+    use crate::FEATURES;
 
     const SIDE: usize = 40;
 
@@ -233,6 +256,7 @@ mod tests {
             features,
             reference: None,
             mask: Some(vec![1.0; pixels]),
+            alpha: None,
             clamped: 0,
         }
     }
@@ -303,7 +327,17 @@ mod tests {
         let mut frame = mapped(room(CAMERA), NORMAL, |n| n.map(|x| 2.0 * x));
         frame.mask = Some(vec![0.0; SIDE * SIDE]);
         assert_eq!(found(&frame), [""; 0]);
-        assert_eq!(found(&crate::bundle::testing::frame(1, 1)), [""; 0]);
-        assert_eq!(found(&crate::bundle::testing::frame(2, 40)), [""; 0]);
+        for (width, height) in [(1, 1), (2, 40)] {
+            let pixels = width * height;
+            let tiny = Frame {
+                width,
+                height,
+                color: vec![0.5; 3 * pixels],
+                features: vec![2.0; FEATURES * pixels],
+                mask: None,
+                ..room(CAMERA)
+            };
+            assert_eq!(found(&tiny), [""; 0]);
+        }
     }
 }

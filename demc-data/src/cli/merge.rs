@@ -1,0 +1,106 @@
+//! `demc-data merge`.
+
+use std::ffi::OsString;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+use demc_data::exr::ExrFile;
+use demc_data::exr::merge::{MergeInput, merge};
+
+use super::UsageError;
+
+/// A file argument: `FILE` or `NAME=FILE`.
+#[derive(Debug, PartialEq, Eq)]
+struct Source {
+    prefix: Option<String>,
+    path: PathBuf,
+}
+
+/// Joins the files and prints one line.
+pub fn run(output: &Path, files: &[OsString], overwrite: bool) -> Result<()> {
+    let sources: Vec<Source> = files
+        .iter()
+        .map(|file| Source::parse(file))
+        .collect::<Result<_, UsageError>>()?;
+    check_output(output, &sources, overwrite)?;
+    let mut inputs = Vec::with_capacity(sources.len());
+    for Source { prefix, path } in sources {
+        let file = ExrFile::open(&path)?;
+        inputs.push(MergeInput { file, prefix });
+    }
+    let merged = merge(&mut inputs, output)?;
+    if !merged.conflicts.is_empty() {
+        let names = merged.conflicts.join(", ");
+        eprintln!("note: the files differ in {names}; the first value is kept");
+    }
+    super::print(&format!(
+        "{}: {} channels of {} files: {}\n",
+        output.display(),
+        merged.channels.len(),
+        inputs.len(),
+        merged.channels.join(", ")
+    ))
+}
+
+impl Source {
+    /// Text before the first `=` is the name, unless it contains a path separator.
+    fn parse(argument: &OsString) -> Result<Self, UsageError> {
+        let split = argument.to_str().and_then(|text| text.split_once('='));
+        let Some((name, file)) = split.filter(|(name, _)| !name.contains(['/', '\\'])) else {
+            return Ok(Self {
+                prefix: None,
+                path: argument.into(),
+            });
+        };
+        if name.is_empty() || name.contains(char::is_control) || file.is_empty() {
+            let argument = super::printable(&argument.to_string_lossy());
+            return Err(UsageError(format!("{argument}: expected NAME=FILE")));
+        }
+        Ok(Self {
+            prefix: Some(name.to_owned()),
+            path: file.into(),
+        })
+    }
+}
+
+fn check_output(output: &Path, sources: &[Source], overwrite: bool) -> Result<(), UsageError> {
+    let target = fs::canonicalize(output).ok();
+    let shown = output.display();
+    let is_target = |path: &Path| target.is_some() && fs::canonicalize(path).ok() == target;
+    if let Some(input) = sources.iter().find(|source| is_target(&source.path)) {
+        let input = input.path.display();
+        return Err(UsageError(format!(
+            "output {shown} would replace the input {input}"
+        )));
+    }
+    match target.is_some() && !overwrite {
+        true => Err(UsageError(format!(
+            "{shown} exists; --overwrite replaces it"
+        ))),
+        false => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parsed(argument: &str) -> (Option<String>, String) {
+        let source = Source::parse(&argument.into()).expect(argument);
+        (source.prefix, source.path.display().to_string())
+    }
+
+    #[test]
+    fn a_name_ends_at_the_first_equals_sign() {
+        let named = |name: &str, path: &str| (Some(name.to_owned()), path.to_owned());
+        let plain = |path: &str| (None, path.to_owned());
+        assert_eq!(parsed("a.exr"), plain("a.exr"));
+        assert_eq!(parsed("ref=a=b.exr"), named("ref", "a=b.exr"));
+        assert_eq!(parsed("View 1.ref=a.exr"), named("View 1.ref", "a.exr"));
+        assert_eq!(parsed("./ref=a.exr"), plain("./ref=a.exr"));
+        for bad in ["=a.exr", "ref=", "a\u{1b}[2J=a.exr"] {
+            assert!(Source::parse(&bad.into()).is_err(), "{bad:?}");
+        }
+    }
+}

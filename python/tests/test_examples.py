@@ -1,0 +1,110 @@
+"""Tests that the examples give the same images as `demc-infer denoise`, and that `finetune.py` works.
+
+They need `demc-infer` on the `PATH`, PyTorch, ONNX Runtime, and OpenEXR. Without these they are
+skipped, unless DEMC_REQUIRE_EXAMPLES=1.
+"""
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import unittest
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parents[1]
+ROOT = PACKAGE.parent
+SAMPLE = ROOT / "data" / "sample"
+RENDERERS = ROOT / "tests" / "renderers" / "files"
+FILES = [
+    *(RENDERERS / f"{name}.exr" for name in ("cycles-4.5", "cycles-5.0", "mitsuba-3.9")),
+    *sorted((SAMPLE / "test").glob("*.exr")),
+]
+TOLERANCE = 1e-4
+"""Largest difference, relative to the largest value of the image: the rounding of three runtimes."""
+MISSING = [name for name in ["numpy", "OpenEXR", "torch", "onnxruntime"] if importlib.util.find_spec(name) is None]
+if shutil.which("demc-infer") is None:
+    MISSING.append("demc-infer")
+
+
+def run(*command: object) -> subprocess.CompletedProcess:
+    environment = os.environ | {"PYTHONPATH": str(PACKAGE)}
+    return subprocess.run([*map(str, command)], env=environment, capture_output=True, text=True)
+
+
+@unittest.skipIf(MISSING and os.environ.get("DEMC_REQUIRE_EXAMPLES") != "1", f"no {', '.join(MISSING)}")
+class Examples(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls) -> None:
+        directory = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(directory.cleanup)
+        cls.folder = Path(directory.name)
+        cls.models = {"torch": cls.folder / "demc.safetensors", "onnx": cls.folder / "demc.onnx"}
+        cls.succeed("demc-infer", "export", "--names", "torch", "-o", cls.models["torch"])
+        cls.succeed("demc-infer", "export", "--format", "onnx", "-o", cls.models["onnx"])
+
+    @classmethod
+    def succeed(cls, *command: object) -> str:
+        done = run(*command)
+        if done.returncode != 0:
+            raise AssertionError(f"{command}: {done.stderr}")
+        return done.stdout
+
+    def example(self, kind: str, source: Path, *options: str) -> subprocess.CompletedProcess:
+        script = PACKAGE / "examples" / f"{kind}_denoise.py"
+        return run(sys.executable, script, self.models[kind], source, self.folder / f"{kind}.exr", *options)
+
+    def test_both_give_the_image_and_the_channels_of_demc_infer(self) -> None:
+        import numpy as np
+        from demc.exr import ExrFile
+
+        expected = self.folder / "rust.exr"
+        for source in FILES:
+            self.succeed("demc-infer", "denoise", source, "-o", expected, "--overwrite", "--precision", "float")
+            noisy, theirs = ExrFile(source), ExrFile(expected)
+            for kind in self.models:
+                done = self.example(kind, source)
+                self.assertEqual(done.returncode, 0, done.stderr)
+                ours = ExrFile(self.folder / f"{kind}.exr")
+                self.assertEqual(list(ours.channels), list(theirs.channels))
+                changed = 0
+                for name, channel in theirs.channels.items():
+                    mine = ours.channels[name].pixels
+                    largest = np.abs(channel.pixels).max()
+                    with self.subTest(source.name, kind=kind, channel=name):
+                        self.assertEqual(mine.dtype, channel.pixels.dtype)
+                        self.assertLessEqual(np.abs(mine - channel.pixels).max(), TOLERANCE * largest)
+                    changed += not np.array_equal(mine, noisy.channels[name].pixels)
+                self.assertEqual(changed, 3)
+
+    def test_a_mistake_is_one_line(self) -> None:
+        for kind in self.models:
+            for source, options, message in [
+                (FILES[0], ["--layer", "Glass"], 'no view layer "Glass"; there is ViewLayer'),
+                (FILES[0], ["--layout", "blender"], "neither a preset"),
+                (FILES[2], ["--layout", "demc-exr"], "no channel albedo1.R"),
+                (SAMPLE / "none.exr", [], "No such file"),
+            ]:
+                done = self.example(kind, source, *options)
+                self.assertEqual((done.returncode, done.stderr.count("\n")), (1, 1), done.stderr)
+                self.assertTrue(done.stderr.startswith("error: "), done.stderr)
+                self.assertIn(message, done.stderr)
+
+    def test_fine_tuned_weights_are_imported(self) -> None:
+        tuned, imported = self.folder / "tuned.safetensors", self.folder / "imported.safetensors"
+        script = PACKAGE / "examples" / "finetune.py"
+        options = "--steps", "3", "--batch", "2"
+        text = self.succeed(sys.executable, script, self.models["torch"], tuned, "--data", SAMPLE, *options)
+        self.assertIn("step 3: RelMSE ", text)
+        self.succeed("demc-infer", "import", tuned, "-o", imported)
+        meta = [json.loads(self.succeed("demc-infer", "inspect", "--json", "--model", path)) for path in (self.models["torch"], imported)]
+        self.assertEqual(meta[1]["step"], meta[0]["step"] + 3)
+
+        done = run(sys.executable, script, self.models["torch"], tuned, "--data", self.folder)
+        self.assertEqual((done.returncode, done.stderr.count("\n")), (1, 1), done.stderr)
+
+
+if __name__ == "__main__":
+    unittest.main()
