@@ -151,7 +151,7 @@ def main() -> None:
     parser.add_argument("--model", help="for demc-infer; default: the bundled model")
     parser.add_argument("--demc-infer", default="demc-infer", help="the program")
     parser.add_argument("--demc-data", default="demc-data", help="the program")
-    parser.add_argument("--pictures", action="store_true", help="also write PNG files: each method, then the reference")
+    parser.add_argument("--pictures", action="store_true", help="also write PNG files of each method and the reference (needs pillow)")
     parser.add_argument("--only-render", action="store_true", help="render and stop")
     options = parser.parse_args()
     first, _, last = options.scenes.partition("-")
