@@ -1,7 +1,7 @@
 #!/bin/sh
-# Trains a model like the bundled one: renders the data, runs the 12 stages, exports the weights.
+# Trains a model like the bundled one: renders the data, runs the 13 stages, exports the weights.
 #
-#   configs/bundled/train.sh [--base DIR]   7.5 hours of training and 3 hours of rendering on 2 cores
+#   configs/bundled/train.sh [--base DIR]   8 hours of training and 3 hours of rendering on 2 cores
 #   configs/bundled/train.sh --try          2 steps per stage on data/sample, about 1 minute
 #
 # --base is the data set that the rendered views are added to, by default data/renders. That set (89
@@ -9,7 +9,7 @@
 # repository root.
 #
 # Run it from any directory. It needs demc-train and demc-infer on the PATH. Rendering also needs
-# Python with mitsuba, numpy, OpenEXR, and pyoidn; PYTHON names the interpreter. Rerun the script to
+# Python with mitsuba, bpy, pyluxcore, numpy, OpenEXR, and pyoidn; PYTHON names the interpreter. Rerun the script to
 # resume it: complete data sets and stages are skipped.
 #
 # The result resembles models/demc.safetensors but has other weights:
@@ -55,6 +55,13 @@ render() {
     touch "data/bundled/$name/complete"
 }
 
+# Renders views of stock renderers: stock RENDERER SCENES
+stock() {
+    [ -e data/bundled/clean-d/complete ] && return
+    "$python" tests/renderers/data_set.py "$1" "$2" -o data/bundled/d --with "$base" \
+        --copies 4 --size 192x192 --ref-spp 96
+}
+
 # Denoises the references of a data set: clean NAME RENDERED
 clean() {
     [ -e "data/bundled/$1/complete" ] && return
@@ -90,6 +97,12 @@ render_all() {
     # Stage 12: the same and 506 more views.
     render c1 "$(set_of b5)" --rooms 200 --stills 130 --black 0.5 --sun 1 --seed 51 --ref-spp 96
     clean clean-c c1
+
+    # Stage 13: the base set and 30 views of stock renderers, each listed four times.
+    stock cycles 101-117
+    stock mitsuba 202-208
+    stock luxcore 302-307
+    clean clean-d d
 }
 
 # A trial runs in a directory in which every data set is data/sample.
@@ -97,7 +110,7 @@ if [ -n "$steps" ]; then
     rm -rf runs/bundled-try
     mkdir -p runs/bundled-try/data/bundled
     cd runs/bundled-try
-    for name in clean-a clean-b clean-c; do
+    for name in clean-a clean-b clean-c clean-d; do
         ln -s "$repository/data/sample" "data/bundled/$name"
     done
 else
@@ -115,4 +128,4 @@ for config in "$repository"/configs/bundled/*.toml; do
     demc-train "$@"
 done
 
-demc-infer export --model runs/bundled/12 --precision f16 -o runs/bundled/demc.safetensors
+demc-infer export --model runs/bundled/13 --precision f16 -o runs/bundled/demc.safetensors

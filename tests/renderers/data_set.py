@@ -5,7 +5,8 @@
 Each view becomes one file of the layout `demc-exr`: colour and features of 4 samples per pixel, and a reference with
 other samples, whose own albedo and normal are kept for `python/tools/references.py`. The second albedo is a copy of the
 first. Existing files are kept, so an interrupted command can be repeated. `docs/renderers.md` reports scenes 1 to 4; this
-script refuses them.
+script refuses them. `--with` also lists the training scenes of another data set. `--copies` lists each view several times,
+so that a few views count more.
 """
 
 from __future__ import annotations
@@ -91,6 +92,8 @@ def main() -> None:
     parser.add_argument("--size", default="224x224")
     parser.add_argument("--spp", type=int, default=4)
     parser.add_argument("--ref-spp", type=int, default=128)
+    parser.add_argument("--copies", type=int, default=1)
+    parser.add_argument("--with", dest="other", type=Path, metavar="DIR")
     options = parser.parse_args()
     first, _, last = options.scenes.partition("-")
     numbers = range(int(first), int(last or first) + 1)
@@ -100,6 +103,11 @@ def main() -> None:
     manifest = options.output / "manifest.json"
     listed = json.loads(manifest.read_text()) if manifest.exists() else {"format": "demc-exr 1", "scenes": []}
     known = {scene["name"] for scene in listed["scenes"]}
+    if options.other:
+        for scene in json.loads((options.other / "manifest.json").read_text())["scenes"]:
+            if scene["split"] == "train" and scene["name"] not in known:
+                file = os.path.relpath((options.other / scene["file"]).resolve(), options.output.resolve())
+                listed["scenes"].append(scene | {"file": file})
     width, height = map(int, options.size.split("x"))
     for number in numbers:
         name = f"{options.renderer}-{number}"
@@ -107,7 +115,8 @@ def main() -> None:
             continue
         write(options.output / "train" / f"{name}.exr", view(options.renderer, number, options))
         about = {"name": name, "split": "train", "base": f"stock-{number}", "file": f"train/{name}.exr", "width": width, "height": height}
-        listed["scenes"].append(about | {"spp": options.spp, "ref_spp": options.ref_spp, "renderer": options.renderer})
+        about |= {"spp": options.spp, "ref_spp": options.ref_spp, "renderer": options.renderer}
+        listed["scenes"] += [about] + [about | {"name": f"{name}-copy-{copy}"} for copy in range(2, options.copies + 1)]
         manifest.write_text(json.dumps(listed, indent=1))
         print(name, flush=True)
 
