@@ -60,12 +60,12 @@ pub fn run(args: &IndexArguments) -> Result<()> {
         found[0].layout,
     );
     if ignored > 0 {
-        summary += &format!("; {ignored} other files or links ignored");
+        summary += &format!("; other files and links, ignored: {ignored}");
     }
     let entries: Vec<Value> = scenes.iter().map(|scene| before.entry(scene)).collect();
     let gone = before.scenes.len();
     if gone > 0 {
-        summary += &format!("; {gone} scenes of the old manifest dropped");
+        summary += &format!("; scenes of the old manifest without a file, dropped: {gone}");
     }
     let mut keys = before.keys;
     keys.insert("scenes".to_owned(), Value::Array(entries));
@@ -200,11 +200,7 @@ fn check(root: &Path, files: &[PathBuf], layout: Option<&str>) -> Result<Vec<Fou
     Ok(found)
 }
 
-fn header(
-    root: &Path,
-    relative: &Path,
-    chosen: Option<&(&str, ChannelLayout)>,
-) -> Result<Found> {
+fn header(root: &Path, relative: &Path, chosen: Option<&(&str, ChannelLayout)>) -> Result<Found> {
     let path = root.join(relative);
     let shown = path.display();
     let parts = relative.iter().map(|part| part.to_str());
@@ -255,8 +251,8 @@ impl Rules {
         };
         let regex = |text: &String| {
             let shown = printable(text);
-            let regex = Regex::new(text)
-                .map_err(|error| UsageError(format!("--base {shown}: {error}")))?;
+            let regex =
+                Regex::new(text).map_err(|error| UsageError(format!("--base {shown}: {error}")))?;
             // The whole match counts as a group.
             match regex.captures_len() {
                 2 => Ok(regex),
@@ -294,7 +290,9 @@ impl Rules {
             ..
         } in found
         {
-            let path = file.rsplit_once('.').map_or(file.as_str(), |(path, _)| path);
+            let path = file
+                .rsplit_once('.')
+                .map_or(file.as_str(), |(path, _)| path);
             let name = match unique {
                 true => stem(file).to_owned(),
                 false => path.replace('/', "-"),

@@ -165,8 +165,9 @@ impl Cli {
                 args.json,
             ),
             DataCommand::Index(args) => index::run(&args).map(|()| ExitCode::SUCCESS),
-            DataCommand::Merge(args) => merge::run(&args.output, &args.files, args.overwrite)
-                .map(|()| ExitCode::SUCCESS),
+            DataCommand::Merge(args) => {
+                merge::run(&args.output, &args.files, args.overwrite).map(|()| ExitCode::SUCCESS)
+            }
         }
     }
 }

@@ -67,10 +67,7 @@ pub struct Merged {
 /// [`Error::Merge`] without files, for a file without channels, for channels of one name, and for
 /// channels that cover different pixels. [`Error::Exr`] and [`Error::Read`] for a damaged input.
 /// [`Error::Write`] for the output.
-pub fn merge<R: Read + Seek>(
-    inputs: &mut [MergeInput<R>],
-    output: &Path,
-) -> Result<Merged, Error> {
+pub fn merge<R: Read + Seek>(inputs: &mut [MergeInput<R>], output: &Path) -> Result<Merged, Error> {
     let mut columns = columns(inputs)?;
     check_windows(inputs, &columns)?;
     columns.sort_by(|a, b| a.name.cmp(&b.name));
@@ -238,8 +235,9 @@ fn planes<R: Read + Seek>(
     let mut planes: Vec<Option<Plane>> = vec![None; columns.len()];
     for (index, input) in inputs.iter_mut().enumerate() {
         let own = columns.iter().enumerate().filter(|(_, c)| c.input == index);
-        let (places, names): (Vec<usize>, Vec<&str>) =
-            own.map(|(place, c)| (place, c.channel.name.as_str())).unzip();
+        let (places, names): (Vec<usize>, Vec<&str>) = own
+            .map(|(place, c)| (place, c.channel.name.as_str()))
+            .unzip();
         for (place, plane) in places.into_iter().zip(input.file.read(&names)?) {
             planes[place] = Some(plane);
         }

@@ -300,7 +300,10 @@ fn put(line: &[f32], kind: SampleType, data: &mut Vec<u8>) -> usize {
 /// Writes the headers of a finished file again, with attributes sorted by name, as OpenEXR's own
 /// library does. The `exr` crate writes unknown attributes in the random order of a hash map, so
 /// equal images would give different bytes. The length does not change.
-pub(super) fn sort_attributes<W: Write + Seek>(writer: &mut W, headers: &Headers) -> Result<(), ExrError> {
+pub(super) fn sort_attributes<W: Write + Seek>(
+    writer: &mut W,
+    headers: &Headers,
+) -> Result<(), ExrError> {
     writer.seek(SeekFrom::Start(HEADERS_START))?;
     for header in headers {
         writer.write_all(&sorted(header)?)?;

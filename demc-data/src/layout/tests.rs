@@ -57,7 +57,8 @@ fn an_unknown_name_lists_the_presets() {
         .expect_err("no such preset")
         .to_string();
     assert!(
-        error.contains("maya") && error.contains("demc-exr, mitsuba3, pbrt-v4, cycles, luxcore, fbksd"),
+        error.contains("maya")
+            && error.contains("demc-exr, mitsuba3, pbrt-v4, cycles, luxcore, fbksd"),
         "{error}"
     );
 }
