@@ -60,12 +60,12 @@ pub fn run(args: &IndexArguments) -> Result<()> {
         found[0].layout,
     );
     if ignored > 0 {
-        summary += &format!("; {ignored} other files or links ignored");
+        summary += &format!("; other files and links, ignored: {ignored}");
     }
     let entries: Vec<Value> = scenes.iter().map(|scene| before.entry(scene)).collect();
     let gone = before.scenes.len();
     if gone > 0 {
-        summary += &format!("; {gone} scenes of the old manifest dropped");
+        summary += &format!("; scenes of the old manifest without a file, dropped: {gone}");
     }
     let mut keys = before.keys;
     keys.insert("scenes".to_owned(), Value::Array(entries));

@@ -32,16 +32,18 @@ const DARK: f64 = 0.05;
 /// Smallest mean of a block that tells the exposure, in exposures of the reference.
 const BRIGHT: f64 = 0.1;
 
-/// The first mistake of a scene's reference; later checks assume the earlier ones.
-pub(super) fn findings(name: &str, frame: &Frame) -> Vec<Finding> {
-    let found = frame.reference.as_deref().and_then(|r| mistake(frame, r));
+/// The first mistake of a scene's reference; later checks assume the earlier ones. If the noisy image
+/// is `filtered`, its details are not those of the reference, and the noise is not compared.
+pub(super) fn findings(name: &str, frame: &Frame, filtered: bool) -> Vec<Finding> {
+    let reference = frame.reference.as_deref();
+    let found = reference.and_then(|reference| mistake(frame, reference, filtered));
     let finding = found.map(|(problem, cause, detail)| Finding::new(problem, cause, name, detail));
     finding.into_iter().collect()
 }
 
 type Mistake = (&'static str, &'static str, String);
 
-fn mistake(frame: &Frame, reference: &[f32]) -> Option<Mistake> {
+fn mistake(frame: &Frame, reference: &[f32], filtered: bool) -> Option<Mistake> {
     let light = exposure(&frame.color);
     if light == 0.0 {
         let cause = "is another channel called so, or is a light missing?";
@@ -66,7 +68,7 @@ fn mistake(frame: &Frame, reference: &[f32]) -> Option<Mistake> {
             let images = [&frame.color[..], reference];
             let [noisy, clean] = images.map(|image| Details::of(image, frame));
             let (noisy, clean) = (noisy?, clean?);
-            shifted(&noisy, &clean).or_else(|| noise(&noisy, &clean))
+            shifted(&noisy, &clean).or_else(|| noise(&noisy, &clean).filter(|_| !filtered))
         })
 }
 

@@ -66,14 +66,19 @@ pub(super) fn examine(
         );
     }
     let correlation = noise::correlation(&frame.color, width, height);
-    if let Some(correlation) = correlation.filter(|value| *value >= CORRELATED) {
+    let correlation = correlation.filter(|value| *value >= CORRELATED);
+    if let Some(correlation) = correlation {
         add(
             "noise of neighbouring pixels correlates",
             "set the renderer's pixel filter to box",
             format!("by {correlation:.2}"),
         );
     }
-    findings.extend(reference::findings(&scene.name, &frame));
+    findings.extend(reference::findings(
+        &scene.name,
+        &frame,
+        correlation.is_some(),
+    ));
     findings.extend(features(&scene.name, &frame, layout));
     let image = Image::of(&frame);
     (findings, Some(image))

@@ -32,7 +32,11 @@ pub(super) fn decompress(meta: &MetaData, chunk: Chunk) -> Result<UncompressedBl
     }) = &chunk.compressed_block
     {
         check_density(header, area.area(), bytes.len() as u64)?;
-        if let Compression::DWAA(_) | Compression::DWAB(_) = header.compression {
+        // An incompressible block is stored as it is, without sizes.
+        let stored = bytes.len() == area.area() * header.channels.bytes_per_pixel;
+        if let Compression::DWAA(_) | Compression::DWAB(_) = header.compression
+            && !stored
+        {
             let sizes = bytes.as_chunks().0.iter().take(DWA_SIZES);
             let mut sizes = sizes.map(|&bytes| u64::from_le_bytes(bytes));
             // Samples of 8x8 squares, including partial ones, of two or four bytes, plus the growth
