@@ -44,9 +44,9 @@ const DARK: f64 = 0.05;
 /// The correlation of the noise of horizontally and vertically neighbouring pixels: about 0 with a
 /// box filter, 0.4 with Mitsuba's default Gaussian. [`CORRELATED`] or more shows a wide filter.
 ///
-/// `None` if there is too little noise to tell: the image is black, has many samples per pixel, is
-/// mostly content, or has fewer than 16 blocks of 16x16 pixels. The estimate is meant for images of
-/// few samples per pixel, such as 4 to 16; content may reach 0.3 in references.
+/// `None` if there is too little noise to tell: a black image, many samples per pixel, mostly content,
+/// or fewer than 16 blocks of 16x16 pixels. The estimate is meant for few samples per pixel, such as
+/// 4 to 16. Content may reach 0.3 in references.
 ///
 /// # Shapes
 /// `color_hdr` is planar `[3, height, width]`, linear radiance, finite.

@@ -3,36 +3,11 @@
 mod support;
 
 use std::fs;
-use std::process::{Command, Output};
 
 use exr::prelude::FlatSamples;
 use serde_json::Value;
+use support::program::{demc_data, refusal, stdout};
 use support::{ZIP, half, named, part, sample, write, write_parts};
-
-fn demc_data(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_demc-data"))
-        .args(args)
-        .output()
-        .expect("the binary starts")
-}
-
-fn stdout(args: &[&str]) -> String {
-    let output = demc_data(args);
-    assert!(
-        output.status.success(),
-        "{}",
-        String::from_utf8_lossy(&output.stderr)
-    );
-    String::from_utf8(output.stdout).expect("text")
-}
-
-fn refusal(args: &[&str], status: i32) -> String {
-    let output = demc_data(args);
-    let message = String::from_utf8(output.stderr).expect("text");
-    assert_eq!(output.status.code(), Some(status), "{message}");
-    assert!(message.starts_with("error: "), "{message}");
-    message
-}
 
 #[test]
 fn inspect_lists_every_channel_with_its_range() {

@@ -269,5 +269,5 @@ fn a_file_without_channels_is_refused() {
     let end = start + 4 + size as usize;
     let empty = [1, 0, 0, 0, 0];
     fs::write(&path, [&bytes[..start], &empty, &bytes[end..]].concat()).expect("writable");
-    files.refused(&[(None, &path)], "has no channels");
+    files.refused(&[(None, &path)], "at least one channel is required");
 }

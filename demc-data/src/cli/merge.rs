@@ -21,7 +21,7 @@ struct Source {
 pub fn run(output: &Path, files: &[OsString], overwrite: bool) -> Result<()> {
     let sources: Vec<Source> = files
         .iter()
-        .map(|file| Source::parse(file))
+        .map(Source::parse)
         .collect::<Result<_, UsageError>>()?;
     check_output(output, &sources, overwrite)?;
     let mut inputs = Vec::with_capacity(sources.len());

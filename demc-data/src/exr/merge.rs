@@ -64,9 +64,8 @@ pub struct Merged {
 /// Joins files. The output is complete or absent. All planes are in memory at once.
 ///
 /// # Errors
-/// [`Error::Merge`] without files, for a file without channels, for channels of one name, and for
-/// channels that cover different pixels. [`Error::Exr`] and [`Error::Read`] for a damaged input.
-/// [`Error::Write`] for the output.
+/// [`Error::Merge`] without files, for channels of one name, and for channels that cover different
+/// pixels. [`Error::Exr`] and [`Error::Read`] for a damaged input. [`Error::Write`] for the output.
 pub fn merge<R: Read + Seek>(inputs: &mut [MergeInput<R>], output: &Path) -> Result<Merged, Error> {
     let mut columns = columns(inputs)?;
     check_windows(inputs, &columns)?;
@@ -94,10 +93,6 @@ struct Column {
 fn columns<R: Read + Seek>(inputs: &[MergeInput<R>]) -> Result<Vec<Column>, Error> {
     let mut columns = Vec::new();
     for (input, MergeInput { file, prefix }) in inputs.iter().enumerate() {
-        if file.channels().is_empty() {
-            let path = file.path().display();
-            return Err(Error::Merge(format!("{path} has no channels")));
-        }
         columns.extend(file.channels().iter().map(|channel| Column {
             name: match prefix {
                 Some(prefix) => format!("{prefix}.{}", channel.name),

@@ -3,6 +3,7 @@
 
 pub mod batches;
 pub mod files;
+pub mod program;
 pub mod rewritten;
 
 use std::path::{Path, PathBuf};
