@@ -275,3 +275,15 @@ fn ensemble_takes_1_4_or_8_passes() {
     let listed = "the number of passes must be 1, 4 or 8";
     assert!(outcome.stderr.contains(listed), "{}", outcome.stderr);
 }
+
+#[test]
+fn an_export_can_store_another_layout() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let run = run_directory();
+    let file = directory.path().join("cycles.safetensors");
+    export(run.path(), &file, &["--layout", "cycles"]).success();
+    let shown = demc_infer(arguments!["inspect", "--model", file]).success();
+    shown.says("Combined.R");
+    export(run.path(), &file, &["--layout", "nonsense"])
+        .failure(2, "layout nonsense: neither a preset");
+}

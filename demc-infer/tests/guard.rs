@@ -2,8 +2,11 @@
 
 mod common;
 
-use common::{demc_infer, random_bundle, sample};
-use demc_data::{DataConfig, Dataset, Frame, Split, Statistics, read_frame};
+use common::{demc_infer, random_bundle, sample, sample_image};
+use demc_data::{
+    ChannelLayout, DataConfig, Dataset, Frame, Split, Statistics, WriteOptions, read_frame,
+    write_denoised,
+};
 use demc_infer::{Bundle, Names, Precision};
 
 fn trained() -> (Bundle, Vec<(Split, Frame)>) {
@@ -121,4 +124,41 @@ fn check_prints_the_table_and_fails_on_a_warning() {
         "{}",
         outcome.stderr
     );
+}
+
+/// The noise of a pixel filter wider than a box: each pixel has a share of its neighbours.
+#[test]
+fn check_names_a_wide_pixel_filter() {
+    let directory = tempfile::tempdir().expect("a directory");
+    let (source, filtered) = (
+        sample_image("gen-room-test-1.exr"),
+        directory.path().join("wide.exr"),
+    );
+    let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
+    let frame = read_frame(&source, &layout).expect("the sample is sound");
+    let (width, height) = (frame.width, frame.height);
+    let at = |i: usize, dy: usize, dx: usize| {
+        let (plane, pixel) = (i / (width * height), i % (width * height));
+        let (y, x) = (pixel / width + dy, pixel % width + dx);
+        let (y, x) = (y.clamp(1, height) - 1, x.clamp(1, width) - 1);
+        frame.color[(plane * height + y) * width + x]
+    };
+    let wide = |i| {
+        let beside = at(i, 0, 1) + at(i, 2, 1) + at(i, 1, 0) + at(i, 1, 2);
+        0.6 * at(i, 1, 1) + 0.1 * beside
+    };
+    let color: Vec<f32> = (0..frame.color.len()).map(wide).collect();
+    let options = WriteOptions::default();
+    write_denoised(&source, &layout, &color, &filtered, &options).expect("written");
+    let sharp = demc_infer(arguments!["check", source]).success();
+    assert!(!sharp.stdout.contains("pixel filter"), "{}", sharp.stdout);
+    let outcome = demc_infer(arguments!["check", filtered]);
+    assert!(
+        outcome
+            .stdout
+            .contains("set the renderer's pixel filter to box"),
+        "{}",
+        outcome.stdout
+    );
+    assert_eq!(outcome.code, 1);
 }
