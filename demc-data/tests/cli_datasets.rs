@@ -79,6 +79,43 @@ fn merge_joins_the_files_of_luxcore() {
 }
 
 #[test]
+fn merge_strips_the_layer_of_a_blender_reference() {
+    let dir = Dir::new();
+    let files = sample().join("../../tests/renderers/files");
+    let file = |name: &str| {
+        files
+            .join(name)
+            .to_str()
+            .expect("a readable path")
+            .to_owned()
+    };
+    let (noisy, reference) = (file("cycles-5.0.exr"), file("cycles-reference.exr"));
+    let output = dir.text("scene.exr");
+    let reference = format!("ref={reference}");
+    let strip = ["--strip", "ViewLayer.Combined"];
+    let text = stdout(&[
+        "merge", "-o", &output, &noisy, &reference, strip[0], strip[1],
+    ]);
+    assert!(
+        text.contains("ViewLayer.Combined.R") && text.contains("ref.R"),
+        "{text}"
+    );
+    let text = stdout(&["index", &dir.text("")]);
+    assert!(text.contains("layout cycles"), "{text}");
+    let other = [
+        "merge",
+        "-o",
+        &output,
+        "--overwrite",
+        &noisy,
+        &reference,
+        "--strip",
+        "Beauty",
+    ];
+    refused(&other, 2, "--strip Beauty: no channel");
+}
+
+#[test]
 fn merge_refuses_what_would_lose_something() {
     let dir = Dir::new();
     let (a, b) = (dir.rgb("a.exr", (4, 2)), dir.rgb("b.exr", (2, 2)));

@@ -19,7 +19,12 @@ fn joined(output: &Path, files: &[(Option<&str>, &Path)]) -> Result<Merged, Erro
     let inputs = files.iter().map(|(prefix, path)| {
         let file = ExrFile::open(path)?;
         let prefix = prefix.map(str::to_owned);
-        Ok(MergeInput { file, prefix })
+        let strip = None;
+        Ok(MergeInput {
+            file,
+            prefix,
+            strip,
+        })
     });
     merge(&mut inputs.collect::<Result<Vec<_>, Error>>()?, output)
 }

@@ -8,7 +8,7 @@ use anyhow::Result;
 use demc_data::exr::ExrFile;
 use demc_data::exr::merge::{MergeInput, merge};
 
-use super::UsageError;
+use super::{MergeArguments, UsageError, printable};
 
 /// A file argument: `FILE` or `NAME=FILE`.
 #[derive(Debug, PartialEq, Eq)]
@@ -18,16 +18,33 @@ struct Source {
 }
 
 /// Joins the files and prints one line.
-pub fn run(output: &Path, files: &[OsString], overwrite: bool) -> Result<()> {
-    let sources: Vec<Source> = files
-        .iter()
-        .map(Source::parse)
-        .collect::<Result<_, UsageError>>()?;
-    check_output(output, &sources, overwrite)?;
+pub fn run(args: &MergeArguments) -> Result<()> {
+    let output = args.output.as_path();
+    let files = args.files.iter();
+    let sources: Vec<Source> = files.map(Source::parse).collect::<Result<_, _>>()?;
+    check_output(output, &sources, args.overwrite)?;
     let mut inputs = Vec::with_capacity(sources.len());
     for Source { prefix, path } in sources {
         let file = ExrFile::open(&path)?;
-        inputs.push(MergeInput { file, prefix });
+        // Files without a name keep their channels' names.
+        let strip = args.strip.clone().filter(|_| prefix.is_some());
+        inputs.push(MergeInput {
+            file,
+            prefix,
+            strip,
+        });
+    }
+    if let Some(strip) = &args.strip {
+        let start = format!("{strip}.");
+        let named = inputs.iter().filter(|input| input.prefix.is_some());
+        let mut channels = named.flat_map(|input| input.file.channels());
+        if !channels.any(|channel| channel.name.starts_with(&start)) {
+            return Err(UsageError(format!(
+                "--strip {}: no channel of a file with a NAME starts with it",
+                printable(strip)
+            ))
+            .into());
+        }
     }
     let merged = merge(&mut inputs, output)?;
     if !merged.conflicts.is_empty() {
@@ -54,7 +71,7 @@ impl Source {
             });
         };
         if name.is_empty() || name.contains(char::is_control) || file.is_empty() {
-            let argument = super::printable(&argument.to_string_lossy());
+            let argument = printable(&argument.to_string_lossy());
             return Err(UsageError(format!("{argument}: expected NAME=FILE")));
         }
         Ok(Self {

@@ -102,6 +102,9 @@ struct MergeArguments {
     /// Files to join; a path with `=` in its first directory or name is written as `./PATH`
     #[arg(required = true, value_name = "[NAME=]FILE")]
     files: Vec<OsString>,
+    /// Remove `LAYER.` from the channel names of files with a NAME, such as ViewLayer.Combined
+    #[arg(long, value_name = "LAYER")]
+    strip: Option<String>,
     /// Replace an existing output
     #[arg(long)]
     overwrite: bool,
@@ -165,9 +168,7 @@ impl Cli {
                 args.json,
             ),
             DataCommand::Index(args) => index::run(&args).map(|()| ExitCode::SUCCESS),
-            DataCommand::Merge(args) => {
-                merge::run(&args.output, &args.files, args.overwrite).map(|()| ExitCode::SUCCESS)
-            }
+            DataCommand::Merge(args) => merge::run(&args).map(|()| ExitCode::SUCCESS),
         }
     }
 }

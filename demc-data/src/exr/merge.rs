@@ -49,6 +49,8 @@ pub struct MergeInput<R> {
     pub file: ExrFile<R>,
     /// Its channels are called `PREFIX.channel`; without a prefix they keep their names.
     pub prefix: Option<String>,
+    /// A start of the channels' names, without its dot, that is removed before the prefix is added.
+    pub strip: Option<String>,
 }
 
 /// The result of a merge.
@@ -92,14 +94,29 @@ struct Column {
 
 fn columns<R: Read + Seek>(inputs: &[MergeInput<R>]) -> Result<Vec<Column>, Error> {
     let mut columns = Vec::new();
-    for (input, MergeInput { file, prefix }) in inputs.iter().enumerate() {
-        columns.extend(file.channels().iter().map(|channel| Column {
-            name: match prefix {
-                Some(prefix) => format!("{prefix}.{}", channel.name),
-                None => channel.name.clone(),
-            },
-            input,
-            channel: channel.clone(),
+    for (
+        input,
+        MergeInput {
+            file,
+            prefix,
+            strip,
+        },
+    ) in inputs.iter().enumerate()
+    {
+        columns.extend(file.channels().iter().map(|channel| {
+            let stripped = strip.as_deref().and_then(|strip| {
+                let rest = channel.name.strip_prefix(strip)?;
+                rest.strip_prefix('.')
+            });
+            let name = stripped.unwrap_or(&channel.name);
+            Column {
+                name: match prefix {
+                    Some(prefix) => format!("{prefix}.{name}"),
+                    None => name.to_owned(),
+                },
+                input,
+                channel: channel.clone(),
+            }
         }));
     }
     match columns.is_empty() {

@@ -2,9 +2,13 @@
 
 use std::process::{Command, Output};
 
+/// Its path; there is none without the feature `cli`.
+const PROGRAM: Option<&str> = option_env!("CARGO_BIN_EXE_demc-data");
+
 /// Runs the program.
 pub fn demc_data(args: &[&str]) -> Output {
-    Command::new(option_env!("CARGO_BIN_EXE_demc-data").expect("feature cli"))
+    let program = PROGRAM.expect("the feature cli");
+    Command::new(program)
         .args(args)
         .output()
         .expect("the binary starts")
