@@ -9,7 +9,7 @@
 # repository root.
 #
 # Run it from any directory. It needs demc-train and demc-infer on the PATH. Rendering also needs
-# Python with mitsuba, bpy, pyluxcore, numpy, OpenEXR, and pyoidn; PYTHON names the interpreter. Rerun the script to
+# Python with mitsuba, bpy, pyluxcore, numpy, OpenEXR, pyoidn, and safetensors; PYTHON names the interpreter. Rerun the script to
 # resume it: complete data sets and stages are skipped.
 #
 # The result resembles models/demc.safetensors but has other weights:
@@ -128,4 +128,10 @@ for config in "$repository"/configs/bundled/*.toml; do
     demc-train "$@"
 done
 
-demc-infer export --model runs/bundled/13 --precision f16 -o runs/bundled/demc.safetensors
+[ -z "$steps" ] || exit 0
+# The bundled model is 0.7 of stage 13 and 0.3 of stage 12.
+for stage in 12 13; do
+    demc-infer export --model "runs/bundled/$stage" -o "runs/bundled/$stage.safetensors"
+done
+"$python" configs/bundled/average.py runs/bundled/12.safetensors runs/bundled/13.safetensors 0.7 runs/bundled/mean.safetensors
+demc-infer export --model runs/bundled/mean.safetensors --precision f16 -o runs/bundled/demc.safetensors
