@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-PRESETS = ("demc-exr", "mitsuba3", "pbrt-v4", "cycles", "fbksd")
+PRESETS = ("demc-exr", "mitsuba3", "pbrt-v4", "cycles", "luxcore", "fbksd")
 """The layouts that come with the package."""
 BUFFERS = ("normal", "position", "texture1", "texture2")
 """The feature buffers, in the network's order."""

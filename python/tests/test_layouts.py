@@ -169,7 +169,7 @@ class Buffers(Files):
 
     def test_mistakes_in_a_layout_are_named(self) -> None:
         self.write(self.planes(MITSUBA))
-        self.refused("neither a preset (demc-exr, mitsuba3, pbrt-v4, cycles, fbksd) nor a file", "mitsuba")
+        self.refused("neither a preset (demc-exr, mitsuba3, pbrt-v4, cycles, luxcore, fbksd) nor a file", "mitsuba")
         layout = self.folder / "mine.toml"
         good = 'color = ["R", "G", "B"]\nmissing = {normal = "zeros", position = "zeros", texture1 = "zeros", texture2 = "zeros"}\n'
         for text, message in [
