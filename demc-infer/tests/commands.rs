@@ -285,5 +285,5 @@ fn an_export_can_store_another_layout() {
     let shown = demc_infer(arguments!["inspect", "--model", file]).success();
     shown.says("Combined.R");
     export(run.path(), &file, &["--layout", "nonsense"])
-        .failure(2, "layout nonsense: neither a preset");
+        .failure(2, "channel layout nonsense: neither");
 }
