@@ -225,6 +225,8 @@ impl Bundle {
 struct FrameInput<'a> {
     bundle: &'a Bundle,
     frame: &'a Frame,
+    /// The image that is denoised, planar `[3, H, W]`: the frame's colour, or its alpha as grey.
+    color: &'a [f32],
     padding: Padding,
     device: Device,
     ensemble: Ensemble,
@@ -257,6 +259,7 @@ impl<'a> FrameInput<'a> {
         Ok(Self {
             bundle,
             frame,
+            color: &frame.color,
             padding: Padding {
                 height: frame.height,
                 width: frame.width,
@@ -278,7 +281,7 @@ impl<'a> FrameInput<'a> {
         tiles: &Tiles,
         mut progress: impl FnMut(usize, usize),
     ) -> Result<Vec<f32>, DenoiseError> {
-        let mut out = vec![0.0; self.frame.color.len()];
+        let mut out = vec![0.0; self.color.len()];
         let mut bad = 0;
         for (done, (rows, columns)) in tiles.iter().enumerate() {
             progress(done, tiles.count());
@@ -308,18 +311,15 @@ impl<'a> FrameInput<'a> {
         if !varies.contains(&true) {
             return Ok(None);
         }
-        let grey = Frame {
-            color: alpha.repeat(COLOR_CHANNELS),
-            alpha: None,
-            ..self.frame.clone()
-        };
+        let grey = alpha.repeat(COLOR_CHANNELS);
         let input = FrameInput {
             bundle: self.bundle,
-            frame: &grey,
+            frame: self.frame,
+            color: &grey,
             padding: self.padding,
             device: self.device.clone(),
             ensemble: self.ensemble,
-            scale: exposure_scale(ALPHA_LEVEL, demc_data::ranges::exposure(&grey.color)),
+            scale: exposure_scale(ALPHA_LEVEL, demc_data::ranges::exposure(&grey)),
             demodulate: false,
             positions: self.positions,
         };
@@ -345,10 +345,7 @@ impl<'a> FrameInput<'a> {
     /// Returns `[3, rows, columns]` in linear HDR.
     fn tile(&self, rows: &PixelRange, columns: &PixelRange) -> Result<Vec<f32>, DenoiseError> {
         let normalizer = &self.bundle.meta.normalizer;
-        let frame = self.frame;
-        let mut color = self
-            .padding
-            .cut(&frame.color, rows.clone(), columns.clone());
+        let mut color = self.padding.cut(self.color, rows.clone(), columns.clone());
         color.iter_mut().for_each(|value| *value *= self.scale);
         let mut features = self.features(rows, columns);
         let modulation = match self.demodulate {
