@@ -26,6 +26,13 @@ def material_of(material, index):
     if material.kind == "lamp":
         shader = nodes.new("ShaderNodeEmission")
         shader.inputs["Color"].default_value = color
+        # The front alone emits, as in the other renderers.
+        geometry, front = nodes.new("ShaderNodeNewGeometry"), nodes.new("ShaderNodeMath")
+        front.operation = "SUBTRACT"
+        front.inputs[0].default_value = 1.0
+        links.new(geometry.outputs["Backfacing"], front.inputs[1])
+        links.new(front.outputs[0], shader.inputs["Strength"])
+        result.cycles.emission_sampling = "FRONT"
     elif material.kind == "glass":
         shader = nodes.new("ShaderNodeBsdfGlass")
         shader.inputs["IOR"].default_value = 1.5
