@@ -13,13 +13,16 @@
 pub mod adam;
 pub mod average;
 pub mod batch_norm;
+pub mod blend;
 pub mod conv1x1;
 pub mod conv3x3;
 pub mod deconv4x4;
+pub mod filter5x5;
 pub mod grid;
 pub mod isa;
 pub mod memory;
 pub mod pool;
+pub mod power;
 mod product;
 pub mod reduce;
 pub mod reference;

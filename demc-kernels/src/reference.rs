@@ -197,3 +197,75 @@ pub fn deconv4x4_backward(grid: Grid, x: &[f64], weight: &[f64], dy: &[f64]) -> 
         |o, i, tap| (i * outputs + o) * 16 + tap,
     )
 }
+
+/// Every pixel with its own 5x5 kernel, the softmax of its first 25 logits, border replicated. A
+/// 26th logit becomes a fourth channel, its sigmoid.
+pub fn filter5x5(grid: Grid, x: &[f64], logits: &[f64]) -> Vec<f64> {
+    let channels = grid.channels(logits.len());
+    let Grid { height, width, .. } = grid;
+    let mut out = Vec::new();
+    for (pixel, logits) in logits.chunks(channels).enumerate() {
+        let (image, row) = (pixel / (height * width), pixel / width % height);
+        let weights: Vec<f64> = logits[..25].iter().map(|logit| logit.exp()).collect();
+        let sum: f64 = weights.iter().sum();
+        for channel in 0..3 {
+            let taps = weights.iter().enumerate().map(|(tap, weight)| {
+                let y = (row + tap / 5).saturating_sub(2).min(height - 1);
+                let x_at = (pixel % width + tap % 5).saturating_sub(2).min(width - 1);
+                weight / sum * x[((image * height + y) * width + x_at) * 3 + channel]
+            });
+            out.push(taps.sum());
+        }
+        out.extend(
+            logits[25..]
+                .iter()
+                .map(|logit| 1.0 / (1.0 + (-logit).exp())),
+        );
+    }
+    out
+}
+
+/// `y + b U(c - D(y))`: a filtered image of 4 channels, the last one `b`, and the coarser image `c`.
+pub fn blend(grid: Grid, filtered: &[f64], coarse: &[f64]) -> Vec<f64> {
+    let Grid { height, width, .. } = grid;
+    let half = grid.halved();
+    let mut correction = coarse.to_vec();
+    for (i, value) in correction.iter_mut().enumerate() {
+        let (pixel, channel) = (i / 3, i % 3);
+        let image = pixel / (half.height * half.width);
+        let (y, x) = (pixel / half.width % half.height, pixel % half.width);
+        for (dy, dx) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+            let from = (image * height + 2 * y + dy) * width + 2 * x + dx;
+            *value -= 0.25 * filtered[from * 4 + channel];
+        }
+    }
+    // The position of a doubled pixel's centre among the halved ones, and the pixels around it.
+    let around = |doubled: usize, length: usize| {
+        let position = ((doubled as f64 + 0.5) / 2.0 - 0.5).clamp(0.0, (length - 1) as f64);
+        let first = position.floor();
+        let second = (first as usize + 1).min(length - 1);
+        [
+            (first as usize, 1.0 - (position - first)),
+            (second, position - first),
+        ]
+    };
+    let pixels = (0..grid.pixels()).flat_map(|pixel| {
+        let image = pixel / (height * width);
+        let (rows, columns) = (
+            around(pixel / width % height, half.height),
+            around(pixel % width, half.width),
+        );
+        let correction = &correction;
+        (0..3).map(move |channel| {
+            let mut doubled = 0.0;
+            for (y, vertical) in rows {
+                for (x, horizontal) in columns {
+                    let from = (image * half.height + y) * half.width + x;
+                    doubled += vertical * horizontal * correction[from * 3 + channel];
+                }
+            }
+            filtered[pixel * 4 + channel] + filtered[pixel * 4 + 3] * doubled
+        })
+    });
+    pixels.collect()
+}
