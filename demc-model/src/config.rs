@@ -59,12 +59,12 @@ pub enum Reading {
     Released,
 }
 
-/// Initialisation of the output convolution. The paper specifies Xavier for encoders and latent
-/// only (Sec. 4.2).
+/// The head: what follows the decoder's levels. The paper has a convolution to colour, and specifies
+/// Xavier for encoders and latent only (Sec. 4.2).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Head {
-    /// A nearly flat image. The bias is the flat colour with the smallest loss on the training set;
+    /// A convolution that starts at a nearly flat image. The bias is the flat colour with the smallest loss on the training set;
     /// the weights are Xavier times [`crate::init::GREY_HEAD_SCALE`].
     ///
     /// Ours: with plain Xavier most outputs start below zero, where ReLU and x^2.2 have no
@@ -72,8 +72,18 @@ pub enum Head {
     /// the sample its loss is 15 (black: 2.6, the best flat colour: 1.7), and the outputs soon die.
     #[default]
     Grey,
-    /// Xavier weights and a zero bias, as for all other convolutions.
+    /// A convolution with Xavier weights and a zero bias, as for all other convolutions.
     Xavier,
+    /// Kernels: the network predicts the weights with which noisy pixels are averaged, on four
+    /// scales (Bako et al. 2017, Vogels et al. 2018). See [`crate::kernel_head`].
+    Kernel,
+}
+
+impl Head {
+    /// Whether two heads have the same weights; they may differ in the initialisation.
+    pub fn has_weights_of(self, other: Head) -> bool {
+        (self == Head::Kernel) == (other == Head::Kernel)
+    }
 }
 
 /// Initialisation of the detail map, the output of the fusion sub-network. Its activation is a
@@ -225,7 +235,7 @@ pub struct ModelConfig {
     /// Channels of each level as multiples of the base width, from the full resolution down. The
     /// latent has those of the last level.
     pub levels: [usize; LEVELS],
-    /// Initialisation of the output convolution.
+    /// The head, and the initialisation of a convolution.
     pub head: Head,
     /// Initialisation of the detail map.
     pub detail: Detail,

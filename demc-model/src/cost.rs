@@ -44,8 +44,8 @@ impl ModelConfig {
 /// the pixels of the level above. A deconvolution is applied to the level below its own.
 fn share_of_pixels(spec: &WeightSpec) -> f64 {
     let level = match spec.stage {
-        Stage::Fusion | Stage::Head => 0,
-        Stage::Encoder { level, .. } => level,
+        Stage::Fusion => 0,
+        Stage::Encoder { level, .. } | Stage::Head { level } => level,
         Stage::Latent => LEVELS,
         Stage::Decoder { level } => level + usize::from(spec.role == Role::Deconvolution),
     };
@@ -56,6 +56,7 @@ fn share_of_pixels(spec: &WeightSpec) -> f64 {
 mod tests {
     use super::*;
     use crate::config::{Reading, Variant};
+    use crate::kernel_head::KERNEL_LEVELS;
     use burn::tensor::Device;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
@@ -157,7 +158,10 @@ mod tests {
             ["decoder", "levels", index, ..] => Stage::Decoder {
                 level: LEVELS - 1 - number(index),
             },
-            ["decoder", "head", ..] => Stage::Head,
+            ["decoder", "head", ..] => Stage::Head { level: 0 },
+            ["decoder", "kernels", index, ..] => Stage::Head {
+                level: KERNEL_LEVELS - 1 - number(index),
+            },
             _ => panic!("{name}"),
         }
     }
@@ -208,7 +212,7 @@ mod tests {
             assert_eq!(count(Role::RunningVariance, stage), 1);
         }
         assert_eq!(count(Role::NormScale, Stage::Latent), 1);
-        assert_eq!(count(Role::Convolution, Stage::Head), 1);
+        assert_eq!(count(Role::Convolution, Stage::Head { level: 0 }), 1);
         assert!(specs.iter().all(|spec| spec.stage != Stage::Fusion));
         let deepest = specs
             .iter()

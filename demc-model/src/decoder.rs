@@ -1,4 +1,5 @@
-//! The decoder (Sec. 3.2): five deconvolutions, each followed by the fusion of the skips (Eq. 2).
+//! The decoder (Sec. 3.2): five deconvolutions, each followed by the fusion of the skips (Eq. 2),
+//! and the head.
 
 use burn::module::Module;
 use burn::nn::BatchNorm;
@@ -6,17 +7,20 @@ use burn::nn::conv::{Conv2d, ConvTranspose2d};
 
 use crate::config::{COLOR_CHANNELS, Head, LEVELS, ModelConfig};
 use crate::init::{GREY_HEAD_SCALE, Init};
+use crate::kernel_head;
 use crate::layers::{conv3x3, deconv4x4, norm, skip_fusion};
 use crate::ops::{Activation, Maps};
 use crate::weights::{Builder, Stage, WeightsError};
 
-/// Five levels from the deepest to the full resolution, and the output convolution.
+/// Five levels from the deepest to the full resolution, and the head.
 #[derive(Module, Debug)]
 pub struct Decoder {
     /// The levels; index 0 is the deepest, at H/16 x W/16.
     pub levels: Vec<DecoderLevel>,
-    /// The 3x3 convolution to colour, followed by a ReLU.
-    pub head: Conv2d,
+    /// The 3x3 convolution to colour, followed by a ReLU; `None` with a kernel head.
+    pub head: Option<Conv2d>,
+    /// The convolutions to kernels of the last levels, deepest first; none without a kernel head.
+    pub kernels: Vec<Conv2d>,
 }
 
 impl Decoder {
@@ -34,14 +38,26 @@ impl Decoder {
             let channels = [config.channels_below(level), channels[level]];
             DecoderLevel::build(b, config, channels, parts)
         })?;
-        let (weight, bias) = match config.head {
-            Head::Grey => (Init::Xavier(GREY_HEAD_SCALE), Init::Color(head_bias)),
-            Head::Xavier => (Init::Xavier(1.0), Init::Zeros),
+        let init = match config.head {
+            Head::Grey => Some((Init::Xavier(GREY_HEAD_SCALE), Init::Color(head_bias))),
+            Head::Xavier => Some((Init::Xavier(1.0), Init::Zeros)),
+            Head::Kernel => None,
         };
-        let head = b.enter(Stage::Head).part("head", |b| {
-            conv3x3(b, [channels[0], COLOR_CHANNELS], weight, bias)
-        })?;
-        Ok(Decoder { levels, head })
+        let head = init.map(|(weight, bias)| {
+            b.enter(Stage::Head { level: 0 }).part("head", |b| {
+                conv3x3(b, [channels[0], COLOR_CHANNELS], weight, bias)
+            })
+        });
+        let head = head.transpose()?;
+        let kernels = match config.head {
+            Head::Kernel => kernel_head::build(b, &channels)?,
+            Head::Grey | Head::Xavier => Vec::new(),
+        };
+        Ok(Decoder {
+            levels,
+            head,
+            kernels,
+        })
     }
 
     /// Decodes a latent to an image.
@@ -50,14 +66,21 @@ impl Decoder {
     ///
     /// # Shapes
     /// Latent `[B, K_5, H / 32, W / 32]`, skips of level k `[B, K, H / 2^(4 - k), W / 2^(4 - k)]`,
-    /// to `[B, 3, H, W]`, not negative.
-    pub fn forward(&self, latent: Maps, skips: Vec<Vec<Maps>>) -> Maps {
-        let image = self
-            .levels
-            .iter()
-            .zip(skips)
-            .fold(latent, |x, (level, skips)| level.forward(x, skips));
-        image.conv3x3(&self.head, Activation::Relu)
+    /// the noisy colour in gamma space `[B, 3, H, W]`, to `[B, 3, H, W]` in gamma space, not
+    /// negative.
+    pub fn forward(&self, latent: Maps, skips: Vec<Vec<Maps>>, color_gamma: Maps) -> Maps {
+        let mut x = latent;
+        let mut decoded = Vec::new();
+        for (level, skips) in self.levels.iter().zip(skips) {
+            x = level.forward(x, skips);
+            if self.head.is_none() {
+                decoded.push(x.clone());
+            }
+        }
+        match &self.head {
+            Some(head) => x.conv3x3(head, Activation::Relu),
+            None => kernel_head::forward(&self.kernels, decoded, color_gamma),
+        }
     }
 }
 

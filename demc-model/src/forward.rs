@@ -49,7 +49,11 @@ impl Denoiser {
             .and_then(|last| last.bottom.take())
             .expect("the last encoder feeds the latent");
         self.decoder
-            .forward(self.latent.forward(bottom), skips_by_level(encoded))
+            .forward(
+                self.latent.forward(bottom),
+                skips_by_level(encoded),
+                color_gamma,
+            )
             .into_nchw()
     }
 

@@ -7,7 +7,7 @@ use burn::module::{Module, Param};
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
 use burn::nn::{BatchNorm, PaddingConfig2d};
 
-use crate::init::Init;
+use crate::init::{GREY_HEAD_SCALE, Init};
 use crate::ops::{Activation, Maps};
 use crate::weights::{Builder, Role, WeightsError};
 
@@ -64,6 +64,11 @@ pub(crate) fn conv3x3(
     bias: Init,
 ) -> Result<Conv2d, WeightsError> {
     conv(b, channels, 3, weight, bias)
+}
+
+/// A 1x1 convolution, initialised as nearly zero.
+pub(crate) fn conv1x1(b: &mut Builder, channels: [usize; 2]) -> Result<Conv2d, WeightsError> {
+    conv(b, channels, 1, Init::Xavier(GREY_HEAD_SCALE), Init::Zeros)
 }
 
 /// The 1x1 convolution of a skip fusion (Eq. 2), initialised as the sum of its inputs (Eq. 3).

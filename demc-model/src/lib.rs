@@ -22,6 +22,7 @@ mod forward;
 pub mod fusion;
 pub mod inference;
 pub mod init;
+pub mod kernel_head;
 pub mod layers;
 pub mod loss;
 pub mod metrics;

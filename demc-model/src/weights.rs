@@ -76,8 +76,11 @@ pub enum Stage {
         /// Level, 0 to 4.
         level: usize,
     },
-    /// The output convolution.
-    Head,
+    /// The output convolution, or a level's convolution to kernels.
+    Head {
+        /// Level, 0 to 3.
+        level: usize,
+    },
 }
 
 /// Description of one tensor of a network.

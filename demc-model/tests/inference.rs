@@ -1,13 +1,17 @@
 //! Inference compared with Burn's operations, which use no folding, no bands and no large tiles.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use demc_model::{Denoiser, ModelConfig, Ops, Reading, Role, Variant, Weights};
+use demc_model::{Denoiser, Head, ModelConfig, Ops, Reading, Role, Variant, Weights};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// Share of the largest value. F(4x4, 3x3) loses up to a digit in each of 27 layers. Measured: 5e-7
 /// to 3e-6.
 const TOLERANCE: f32 = 2e-5;
+
+/// For a kernel head. A softmax of large logits amplifies their errors, and so does the power near
+/// black. Measured: up to 4e-5.
+const KERNEL_TOLERANCE: f32 = 1e-4;
 
 fn config(variant: Variant, reading: Reading, width: usize) -> ModelConfig {
     ModelConfig {
@@ -75,7 +79,11 @@ fn check(config: ModelConfig, size: [usize; 3]) {
     );
     let found = deviation(&run(&model, size), &expected);
     println!("{config} {size:?}: {found:e}");
-    assert!(found <= TOLERANCE, "{config} {size:?}: {found:e}");
+    let tolerance = match config.head {
+        Head::Kernel => KERNEL_TOLERANCE,
+        Head::Grey | Head::Xavier => TOLERANCE,
+    };
+    assert!(found <= tolerance, "{config} {size:?}: {found:e}");
 }
 
 #[test]
@@ -83,7 +91,10 @@ fn inference_agrees_with_burns_operations_on_every_network() {
     for variant in Variant::ALL {
         for reading in Reading::ALL {
             for size in [[1, 32, 32], [2, 64, 96], [1, 96, 32]] {
-                check(config(variant, reading, 6), size);
+                for head in [Head::Grey, Head::Kernel] {
+                    let config = config(variant, reading, 6);
+                    check(ModelConfig { head, ..config }, size);
+                }
             }
         }
     }
@@ -91,6 +102,15 @@ fn inference_agrees_with_burns_operations_on_every_network() {
     check(paper, [1, 64, 96]);
     let levels = [3, 1, 2, 2, 4];
     check(ModelConfig { levels, ..paper }, [1, 64, 96]);
+    let head = Head::Kernel;
+    check(
+        ModelConfig {
+            head,
+            levels,
+            ..paper
+        },
+        [1, 64, 96],
+    );
 }
 
 #[test]

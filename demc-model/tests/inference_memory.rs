@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor};
 use demc_kernels::memory::{Recycler, used};
 use demc_model::config::LEVEL_WIDTHS as PAPER;
 use demc_model::inference::peak_bytes;
-use demc_model::{ModelConfig, Reading, Variant};
+use demc_model::{Head, ModelConfig, Reading, Variant};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -37,11 +37,19 @@ fn check() {
     let device = Device::flex();
     // In the order of their sizes: only the process's peak so far is known.
     let cases = [
+        (Variant::ColorOnly, Reading::Released, 16, EVEN, [256, 512]),
         (Variant::Demc, Reading::Paper, 24, PAPER, [512, 512]),
         (Variant::DemcNosn, Reading::Paper, 24, PAPER, [1024, 512]),
         (Variant::Demc, Reading::Released, 24, PAPER, [768, 1024]),
         (Variant::Semc, Reading::Paper, 32, PAPER, [736, 1280]),
         (Variant::Demc, Reading::Paper, 32, PAPER, [1088, 1920]),
+        (
+            Variant::ColorOnly,
+            Reading::Released,
+            16,
+            EVEN,
+            [1536, 2560],
+        ),
         (Variant::Demc, Reading::Paper, 32, EVEN, [1088, 1920]),
         (Variant::Demc, Reading::Paper, 32, STEEP, [1088, 1920]),
     ];
@@ -51,6 +59,11 @@ fn check() {
             reading,
             width,
             levels,
+            // A network for albedo.
+            head: match variant {
+                Variant::ColorOnly => Head::Kernel,
+                _ => Head::Grey,
+            },
             ..ModelConfig::default()
         };
         let mut rng = ChaCha8Rng::seed_from_u64(1);

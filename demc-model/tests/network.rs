@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Distribution, Tensor, TensorData};
 use demc_model::init::OPEN_BIAS;
-use demc_model::{Denoiser, Detail, ModelConfig, Reading, Variant, Weights, WeightsError};
+use demc_model::{Denoiser, Detail, Head, ModelConfig, Reading, Variant, Weights, WeightsError};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -267,4 +267,56 @@ fn odd_sizes_are_refused() {
         pattern([1, 3, 48, 32], 0.0, &device),
         pattern([1, 12, 48, 32], 0.0, &device),
     );
+}
+
+/// For given features, a kernel head keeps a flat image and scales with the colour.
+#[test]
+fn a_kernel_head_keeps_flat_images() {
+    for (variant, reading) in every_network() {
+        for device in [Device::flex(), Device::flex().autodiff()] {
+            let head = Head::Kernel;
+            let model = network(
+                ModelConfig {
+                    head,
+                    ..config(variant, reading, 2)
+                },
+                3,
+                &device,
+            );
+            let flat = Tensor::<4>::full([1, 3, 64, 64], 0.6, &device);
+            let out = values(model.forward(flat, pattern([1, 12, 64, 64], 1.0, &device)));
+            assert!(out.iter().all(|v| (v - 0.6).abs() < 1e-5), "{variant:?}");
+        }
+    }
+}
+
+/// The first pixel depends on nothing beyond 188 pixels of colour and 192 of features, as with the
+/// other heads, so tiles stay exact.
+#[test]
+fn a_kernel_head_has_the_receptive_field_of_the_network() {
+    let device = Device::flex();
+    let model = network(
+        ModelConfig {
+            head: Head::Kernel,
+            ..config(Variant::Demc, Reading::Paper, 2)
+        },
+        3,
+        &device,
+    );
+    let run = |color: Tensor<4>, features: Tensor<4>| values(model.forward(color, features));
+    let color = pattern([1, 3, 32, 256], 0.0, &device);
+    let features = pattern([1, 12, 32, 256], 1.0, &device);
+    let expected = run(color.clone(), features.clone());
+    let other = |x: Tensor<4>, channels| {
+        let far = Tensor::<4>::full([1, channels, 32, 64], 3.0, &device);
+        Tensor::cat(vec![x.narrow(3, 0, 192), far], 3)
+    };
+    let found = run(other(color, 3), other(features, 12));
+    assert_ne!(found, expected);
+    for channel in 0..3 {
+        for row in 0..32 {
+            let pixel = (channel * 32 + row) * 256;
+            assert_eq!(found[pixel], expected[pixel]);
+        }
+    }
 }

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
-use demc_model::{Denoiser, LossConfig, ModelConfig, Ops, Reading, Variant};
+use demc_model::{Denoiser, Head, LossConfig, ModelConfig, Ops, Reading, Variant};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -179,7 +179,12 @@ fn largest(values: &[f32]) -> f32 {
 fn kernels_agree_with_burns_operations_on_every_network() {
     for variant in Variant::ALL {
         for reading in Reading::ALL {
-            check(config(variant, reading));
+            for head in [Head::Grey, Head::Kernel] {
+                check(ModelConfig {
+                    head,
+                    ..config(variant, reading)
+                });
+            }
         }
     }
     check(ModelConfig {

@@ -6,8 +6,10 @@ use super::BandPlan;
 use super::encoder::DEEPEST_BANDED;
 use super::full_resolution::UPPER_LEVELS;
 use crate::config::{
-    COLOR_CHANNELS, DETAIL_CHANNELS, FEATURE_CHANNELS, Input, LEVELS, ModelConfig, channels_of,
+    COLOR_CHANNELS, DETAIL_CHANNELS, FEATURE_CHANNELS, Head, Input, LEVELS, ModelConfig,
+    channels_of,
 };
+use crate::kernel_head::{KERNEL_LEVELS, logits};
 use crate::ops::Ops;
 
 const VALUE: usize = size_of::<f32>();
@@ -138,6 +140,14 @@ impl PeakEstimate<'_> {
         images + self.detail()
     }
 
+    /// The colour that a kernel head needs after the encoders; a large image's is kept anyway.
+    fn kept_color(&self) -> usize {
+        match self.config.head == Head::Kernel && !self.plan.is_banded(self.grid) {
+            true => self.grid.pixels() * COLOR_CHANNELS,
+            false => 0,
+        }
+    }
+
     /// The skips' shares of some levels' fusions. For a large image the first level's share is not
     /// kept.
     fn sums(&self, levels: std::ops::Range<usize>) -> usize {
@@ -199,7 +209,8 @@ impl PeakEstimate<'_> {
             (0, self.images() + count * self.input(0))
         };
         for level in first..LEVELS {
-            let held = self.skip_sources() + self.sums(0..level + 1) + count * self.input(level);
+            let held = self.skip_sources() + self.kept_color();
+            let held = held + self.sums(0..level + 1) + count * self.input(level);
             let grid = self.grid_of(level);
             let working = if level <= DEEPEST_BANDED && banded(level) {
                 let bands = 3 * self.rows(level, self.plan.band + 2 * WAITING_ROWS);
@@ -233,18 +244,45 @@ impl PeakEstimate<'_> {
             };
             // The decoded rows, and the rows of the level below with their border.
             let working = (share * (self.map(level) + below) as f64) as usize;
-            most = most.max(self.sums(0..level + 1) + below + working + weights);
+            let sums = self.sums(0..level + 1);
+            most = most.max(sums + below + working + weights);
+            most = most.max(sums + self.filter(level));
         }
         let output = self.grid.pixels() * COLOR_CHANNELS;
-        let last = match is_large {
-            true => {
-                let waiting = self.encoder_count() * self.largest_weights(0);
-                self.below(0) + waiting + 3 * self.rows(0, self.plan.band + 2 * WAITING_ROWS)
-            }
+        let bands = self.below(0)
+            + self.encoder_count() * self.largest_weights(0)
+            + 3 * self.rows(0, self.plan.band + 2 * WAITING_ROWS);
+        let last = match (is_large, self.config.head) {
+            (true, Head::Kernel) => self.below(0) + self.filter(0).max(bands),
+            (false, Head::Kernel) => self.map(0) + self.filter(0),
+            (true, _) => output + bands,
             // The head's products: 9 values per output, in whole vectors.
-            false => self.map(0) + self.grid.pixels() * (32 + COLOR_CHANNELS),
+            (false, _) => output + self.map(0) + self.grid.pixels() * (32 + COLOR_CHANNELS),
         };
-        self.skip_sources() + most.max(output + last)
+        self.skip_sources() + self.scales() + most.max(last)
+    }
+
+    /// The scales of the noisy image that a kernel head filters.
+    fn scales(&self) -> usize {
+        let levels = (0..KERNEL_LEVELS).map(|level| self.grid_of(level).pixels());
+        match self.config.head {
+            Head::Kernel => levels.map(|pixels| pixels * COLOR_CHANNELS).sum(),
+            Head::Grey | Head::Xavier => 0,
+        }
+    }
+
+    /// Working memory of a kernel head at a level: the logits of a band, the filtered image with its
+    /// blend weight, and the blend, which needs the output below and its own correction.
+    fn filter(&self, level: usize) -> usize {
+        if self.config.head != Head::Kernel || level >= KERNEL_LEVELS {
+            return 0;
+        }
+        let Grid { height, width, .. } = self.grid_of(level);
+        let pixels = height * width;
+        let logits = self.plan.band.min(height) * width * logits(level);
+        let below = pixels / 4 * COLOR_CHANNELS;
+        let blend = pixels * COLOR_CHANNELS + below;
+        pixels * (COLOR_CHANNELS + 1) + below + logits.max(blend)
     }
 
     fn below(&self, level: usize) -> usize {

@@ -10,11 +10,12 @@ use std::ops::Range;
 
 use demc_kernels::{Grid, memory};
 
-use super::band::{ConvChain, bands};
+use super::band::{ConvChain, RowWindow, bands};
 use super::decoder::folded_level;
 use super::encoder::{BandedLevel, folded_block};
 use super::folded::FoldedConv;
 use super::images::InputImages;
+use super::kernel_head::KernelHead;
 use super::{FeatureMaps, InferencePass};
 use crate::config::{COLOR_CHANNELS, DETAIL_CHANNELS, Input};
 
@@ -115,6 +116,7 @@ impl InferencePass<'_> {
         &self,
         below: &FeatureMaps,
         sources: SkipSources,
+        kernel_head: Option<KernelHead>,
     ) -> Vec<f32> {
         let SkipSources { images, detail } = sources;
         let (grid, inputs) = (images.grid, self.inputs_by_encoder());
@@ -123,8 +125,19 @@ impl InferencePass<'_> {
         let folded = folded_level(level);
         let prepared = self.prepare_level(level, &folded);
         let [_, skip_fusion] = &folded;
-        let head = [FoldedConv::conv(&decoder.head, None)];
-        let mut head = self.chain(&head, grid);
+        let conv = decoder.head.iter();
+        let conv: Vec<FoldedConv> = conv.map(|conv| FoldedConv::conv(conv, None)).collect();
+        let mut output = match kernel_head {
+            Some(head) => OutputRows::Kernels {
+                filtered: head.filtered(0),
+                decoded: RowWindow::new(grid, skip_fusion.outputs()),
+                head,
+            },
+            None => OutputRows::Convolution {
+                chain: self.chain(&conv, grid),
+                planar: memory::buffer(grid.pixels() * COLOR_CHANNELS),
+            },
+        };
         let convs: Vec<Vec<FoldedConv>> = self
             .model
             .encoders
@@ -137,13 +150,9 @@ impl InferencePass<'_> {
             .collect();
         let mut skips: Vec<ConvChain> = convs.iter().map(|convs| self.chain(convs, grid)).collect();
 
-        let plane = grid.height * grid.width;
-        let mut planar = memory::buffer(grid.pixels() * COLOR_CHANNELS);
-        for (image, planar) in planar.chunks_exact_mut(plane * COLOR_CHANNELS).enumerate() {
-            skips
-                .iter_mut()
-                .chain([&mut head])
-                .for_each(ConvChain::restart);
+        for image in 0..grid.batch {
+            skips.iter_mut().for_each(ConvChain::restart);
+            output.restart();
             for rows in bands(grid.height, self.plan.band) {
                 let detail = detail
                     .as_ref()
@@ -159,8 +168,8 @@ impl InferencePass<'_> {
                     }
                     let (band, skip) = chain.output.all();
                     let sum = match index {
-                        0 => head.input().push(skip_rows.len()),
-                        _ => head.input().last_mut(skip_rows.len()),
+                        0 => output.input().push(skip_rows.len()),
+                        _ => output.input().last_mut(skip_rows.len()),
                     };
                     self.add_skip(index, band, skip, skip_fusion, sum);
                     chain.output.free_all();
@@ -168,13 +177,75 @@ impl InferencePass<'_> {
                 if skip_rows.is_empty() {
                     continue;
                 }
-                let sum = head.input().last_mut(skip_rows.len());
+                let sum = output.input().last_mut(skip_rows.len());
                 prepared.fuse_rows(below, image, skip_rows, sum);
-                head.advance(|_, rows, colors| write_rows(planar, grid, rows, colors));
-                head.output.free_all();
+                output.advance(grid, image);
             }
         }
-        planar
+        output.finish()
+    }
+}
+
+/// The head on bands of rows.
+enum OutputRows<'a> {
+    Convolution {
+        chain: ConvChain<'a>,
+        planar: Vec<f32>,
+    },
+    Kernels {
+        head: KernelHead,
+        decoded: RowWindow,
+        filtered: FeatureMaps,
+    },
+}
+
+impl OutputRows<'_> {
+    fn restart(&mut self) {
+        match self {
+            OutputRows::Convolution { chain, .. } => chain.restart(),
+            OutputRows::Kernels { decoded, .. } => decoded.restart(),
+        }
+    }
+
+    /// The rows of the decoder's map.
+    fn input(&mut self) -> &mut RowWindow {
+        match self {
+            OutputRows::Convolution { chain, .. } => chain.input(),
+            OutputRows::Kernels { decoded, .. } => decoded,
+        }
+    }
+
+    /// Computes all rows of an image that the input allows.
+    fn advance(&mut self, grid: Grid, image: usize) {
+        match self {
+            OutputRows::Convolution { chain, planar } => {
+                let values = grid.height * grid.width * COLOR_CHANNELS;
+                let planar = &mut planar[image * values..(image + 1) * values];
+                chain.advance(|_, rows, colors| write_rows(planar, grid, rows, colors));
+                chain.output.free_all();
+            }
+            OutputRows::Kernels {
+                head,
+                decoded,
+                filtered,
+            } => {
+                let (_, values) = decoded.all();
+                head.filter_rows(0, image, decoded.range(), values, filtered);
+                decoded.free_all();
+            }
+        }
+    }
+
+    fn finish(self) -> Vec<f32> {
+        match self {
+            OutputRows::Convolution { planar, .. } => planar,
+            OutputRows::Kernels {
+                mut head, filtered, ..
+            } => {
+                head.blend(filtered);
+                head.finish()
+            }
+        }
     }
 }
 

@@ -41,6 +41,11 @@ impl InputImages {
         }
     }
 
+    /// The planes of the colour, which are shared.
+    pub(super) fn color(&self) -> FlexTensor {
+        self.color.clone()
+    }
+
     /// The planes that `inputs` contain; frees the others.
     pub(super) fn retain(self, inputs: &[Input]) -> Self {
         let has_features = inputs.contains(&Input::Features);

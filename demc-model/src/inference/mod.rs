@@ -21,6 +21,7 @@ mod estimate;
 mod folded;
 mod full_resolution;
 mod images;
+mod kernel_head;
 #[cfg(test)]
 mod tests;
 
@@ -28,16 +29,19 @@ use std::ops::Range;
 
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
+use burn::nn::conv::Conv2d;
 use burn::tensor::{Tensor, TensorData};
 use demc_kernels::conv3x3::{PreparedConvolution, Tile};
 use demc_kernels::{Grid, Isa, grid, memory};
 
 use crate::config::{COLOR_CHANNELS, LEVELS};
+use crate::decoder::Decoder;
 use crate::denoiser::Denoiser;
 use band::TILE_ROWS;
 use encoder::{DEEPEST_BANDED, folded_block};
 use full_resolution::{SkipSources, UPPER_LEVELS};
 use images::InputImages;
+use kernel_head::KernelHead;
 
 pub use estimate::{pass_bytes, peak_bytes, reusable_bytes};
 pub use folded::{FoldedConv, norm_scale};
@@ -76,8 +80,12 @@ fn forward_with(
         plan,
         model,
     };
-    let encoded = pass.encode(InputImages::new(color_gamma, features_z));
-    let out = pass.decode(encoded);
+    let images = InputImages::new(color_gamma, features_z);
+    let (grid, color) = (images.grid, images.color());
+    let encoded = pass.encode(images);
+    let head = KernelHead::new(pass.isa, model, grid, &color);
+    drop(color);
+    let out = pass.decode(encoded, head);
     let shape = [batch, COLOR_CHANNELS, height, width];
     Tensor::from_primitive::<Flex>(FlexTensor::from_data(TensorData::new(out, shape)))
 }
@@ -152,7 +160,7 @@ impl InferencePass<'_> {
         }
     }
 
-    fn decode(&self, encoded: EncodedImages) -> Vec<f32> {
+    fn decode(&self, encoded: EncodedImages, mut head: Option<KernelHead>) -> Vec<f32> {
         let EncodedImages {
             sums,
             sources,
@@ -161,13 +169,18 @@ impl InferencePass<'_> {
         let mut x = self.conv3x3(&bottom, &folded_block(&self.model.latent));
         drop(bottom);
         let decoder = &self.model.decoder;
-        for (level, sum) in decoder.levels.iter().zip(sums.into_iter().rev()) {
+        let levels = decoder.levels.iter().zip(sums.into_iter().rev());
+        for (index, (level, sum)) in levels.enumerate() {
             x = self.decode_level(level, &x, sum);
+            if let Some(head) = &mut head {
+                self.filter_level(head, LEVELS - 1 - index, &x);
+            }
         }
-        match sources {
-            Some(sources) => self.decode_full_resolution(&x, sources),
-            None => {
-                let image = self.conv3x3(&x, &FoldedConv::conv(&decoder.head, None));
+        match (sources, head) {
+            (Some(sources), head) => self.decode_full_resolution(&x, sources, head),
+            (None, Some(head)) => head.finish(),
+            (None, None) => {
+                let image = self.conv3x3(&x, &FoldedConv::conv(conv_head(decoder), None));
                 let mut planar = memory::buffer(image.values.len());
                 grid::nchw_from_nhwc(image.grid, &image.values, &mut planar);
                 planar
@@ -183,6 +196,12 @@ impl InferencePass<'_> {
         prepared.forward(x.grid, &x.values, 0, &mut y.values);
         y
     }
+}
+
+/// The output convolution of a network without a kernel head.
+fn conv_head(decoder: &Decoder) -> &Conv2d {
+    let head = decoder.head.as_ref();
+    head.expect("a head is a convolution or kernels")
 }
 
 struct FeatureMaps {

@@ -67,6 +67,10 @@ fn every_network(check: impl Fn(&Denoiser, &str, [usize; 3])) {
                 check(&model, &format!("{} {size:?}", model.config()), size);
             }
             check(&initialised(levels), &format!("{levels}"), SIZES[1]);
+            let head = Head::Kernel;
+            let kernels = initialised(ModelConfig { head, ..levels });
+            check(&kernels, &format!("{levels}, kernels"), SIZES[1]);
+            check(&kernels, &format!("{levels}, kernels"), SIZES[2]);
         }
     }
 }

@@ -5,7 +5,7 @@ use burn::nn::BatchNorm;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
 use burn::tensor::{Tensor, activation, module::max_pool2d, ops::MaxPoolOptions};
 
-use super::{Ops, kernels};
+use super::{Ops, filter, kernels};
 
 /// The activation after an operation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -127,6 +127,74 @@ impl Maps {
             Ops::Burn => activation.apply(conv.forward(Tensor::cat(tensors, 1))),
         };
         Maps { tensor, ops }
+    }
+
+    /// A 1x1 convolution with bias.
+    ///
+    /// # Shapes
+    /// `[B, in, H, W]` to `[B, out, H, W]`.
+    pub fn conv1x1(self, conv: &Conv2d) -> Self {
+        let tensor = match self.ops {
+            Ops::Kernels => {
+                let (weight, bias) = conv_parameters(conv);
+                kernels::fuse(vec![self.tensor], weight, bias, Activation::None)
+            }
+            Ops::Burn => conv.forward(self.tensor),
+        };
+        Maps { tensor, ..self }
+    }
+
+    /// Gamma-compressed colour in linear light, `max(x, 0)^gamma`. Without a gradient.
+    pub fn radiance(self, gamma: f32) -> Self {
+        let tensor = self.tensor.detach().clamp_min(0.0).powf_scalar(gamma);
+        Maps { tensor, ..self }
+    }
+
+    /// Linear light in gamma space, `x^(1/gamma)` where it is above `darkest`, else 0.
+    pub fn gamma(self, gamma: f32, darkest: f32) -> Self {
+        let visible = self.tensor.clone().detach().greater_elem(darkest).float();
+        let powers = self.tensor.clamp_min(darkest).powf_scalar(1.0 / gamma);
+        let tensor = powers * visible;
+        Maps { tensor, ..self }
+    }
+
+    /// The mean of each 2x2 window. Without a gradient.
+    ///
+    /// # Shapes
+    /// `[B, C, H, W]` to `[B, C, H / 2, W / 2]`.
+    pub fn halve(self) -> Self {
+        let tensor = match self.ops {
+            Ops::Kernels => kernels::halve(self.tensor),
+            Ops::Burn => filter::halve(self.tensor),
+        };
+        Maps { tensor, ..self }
+    }
+
+    /// An image, filtered with a 5x5 kernel per pixel, the softmax of its logits; the border is
+    /// replicated. A 26th logit becomes a fourth channel, its sigmoid. The image has no gradient.
+    ///
+    /// # Shapes
+    /// `[B, 3, H, W]` and logits `[B, 25, H, W]` or `[B, 26, H, W]` to `[B, 3, H, W]` or
+    /// `[B, 4, H, W]`.
+    pub fn filter5x5(self, logits: Maps) -> Self {
+        let tensor = match self.ops {
+            Ops::Kernels => kernels::filter5x5(self.tensor, logits.tensor),
+            Ops::Burn => filter::filter5x5(self.tensor, logits.tensor),
+        };
+        Maps { tensor, ..self }
+    }
+
+    /// `y + b U(coarse - D(y))`: y are the first three channels, b is the fourth; D is the 2x2 mean,
+    /// U the bilinear doubling with half-pixel centres.
+    ///
+    /// # Shapes
+    /// `[B, 4, H, W]` and `[B, 3, H / 2, W / 2]` to `[B, 3, H, W]`.
+    pub fn blend(self, coarse: Maps) -> Self {
+        let tensor = match self.ops {
+            Ops::Kernels => kernels::blend(self.tensor, coarse.tensor),
+            Ops::Burn => filter::blend(self.tensor, coarse.tensor),
+        };
+        Maps { tensor, ..self }
     }
 
     /// Batch normalisation. A device with autodiff uses the statistics of the batch and updates the

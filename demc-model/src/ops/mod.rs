@@ -7,9 +7,11 @@
 //!
 //! - `maps`: [`Maps`], the feature maps that the modules compute with
 //! - `kernels/`: the kernels as a Burn backend extension for `flex`, with gradients
+//! - `filter`: kernels per pixel with Burn's operations
 //! - [`update`]: updates of the weights: Adam's step, the gradient's norm, the moving average
 //! - [`muon`]: Muon's step
 
+mod filter;
 mod kernels;
 mod maps;
 pub mod muon;

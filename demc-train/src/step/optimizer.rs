@@ -132,7 +132,7 @@ impl Optimizer {
     pub fn dormant(&self) -> DormantChannels {
         let mut count = DormantChannels::default();
         let biases = self.specs.iter();
-        for spec in biases.filter(|spec| spec.role == Role::Bias && spec.stage != Stage::Head) {
+        for spec in biases.filter(|spec| spec.role == Role::Bias && !matches!(spec.stage, Stage::Head { .. })) {
             let Some(WeightState::Adam(moments)) = self.states.get(&spec.name) else {
                 continue;
             };
@@ -225,7 +225,7 @@ impl Optimizer {
     /// it, as in Jordan et al.
     fn is_for_muon(&self, spec: &WeightSpec) -> bool {
         let fits = |max| spec.rows().is_some_and(|rows| rows <= max);
-        spec.stage != Stage::Head && self.muon_rows.is_some_and(fits)
+        !matches!(spec.stage, Stage::Head { .. }) && self.muon_rows.is_some_and(fits)
     }
 }
 

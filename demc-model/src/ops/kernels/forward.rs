@@ -2,7 +2,9 @@
 
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
-use demc_kernels::{Grid, Isa, batch_norm, conv1x1, conv3x3, deconv4x4, grid, pool, rel_mse};
+use demc_kernels::{
+    Grid, Isa, batch_norm, blend, conv1x1, conv3x3, deconv4x4, filter5x5, grid, pool, rel_mse,
+};
 
 use super::{KernelOps, buffer, contiguous, dims, grid, maps, tensor, values};
 
@@ -62,6 +64,10 @@ impl KernelOps for Flex {
         maps(grid.doubled(), y)
     }
 
+    fn fuse_one(a: FlexTensor, weight: FlexTensor, bias: FlexTensor, relu: bool) -> FlexTensor {
+        fuse([a], weight, bias, relu)
+    }
+
     fn fuse_two(
         a: FlexTensor,
         b: FlexTensor,
@@ -89,6 +95,30 @@ impl KernelOps for Flex {
         let mut y = buffer(grid.halved().pixels() * channels);
         pool::forward(Isa::current(), grid, values(&x), &mut y);
         maps(grid.halved(), y)
+    }
+
+    fn halve(x: FlexTensor) -> FlexTensor {
+        let x = contiguous(x);
+        let (grid, channels) = grid(&x);
+        let mut y = buffer(grid.halved().pixels() * channels);
+        blend::halve(grid, values(&x), &mut y);
+        maps(grid.halved(), y)
+    }
+
+    fn filter5x5(x: FlexTensor, logits: FlexTensor) -> FlexTensor {
+        let [x, logits] = [x, logits].map(contiguous);
+        let (grid, channels) = grid(&logits);
+        let mut y = buffer(grid.pixels() * (filter5x5::COLORS + channels - filter5x5::TAPS));
+        filter5x5::forward(Isa::current(), grid, values(&x), values(&logits), &mut y);
+        maps(grid, y)
+    }
+
+    fn blend(filtered: FlexTensor, coarse: FlexTensor) -> FlexTensor {
+        let [filtered, coarse] = [filtered, coarse].map(contiguous);
+        let (grid, _) = grid(&filtered);
+        let mut out = buffer(grid.pixels() * filter5x5::COLORS);
+        blend::forward(grid, values(&filtered), values(&coarse), &mut out);
+        maps(grid, out)
     }
 
     fn batch_norm(

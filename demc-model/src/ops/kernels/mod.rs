@@ -36,6 +36,13 @@ pub(super) trait KernelOps: Backend {
         bias: FloatTensor<Self>,
         relu: bool,
     ) -> FloatTensor<Self>;
+    /// Weight `[out, in, 1, 1]`.
+    fn fuse_one(
+        a: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        relu: bool,
+    ) -> FloatTensor<Self>;
     /// Weight `[out, sum of in, 1, 1]`.
     fn fuse_two(
         a: FloatTensor<Self>,
@@ -55,6 +62,12 @@ pub(super) trait KernelOps: Backend {
     ) -> FloatTensor<Self>;
     /// 2x2, stride 2.
     fn max_pool(x: FloatTensor<Self>) -> FloatTensor<Self>;
+    /// The mean of each 2x2 window; not differentiable.
+    fn halve(x: FloatTensor<Self>) -> FloatTensor<Self>;
+    /// An image and 25 or 26 logits per pixel; the image has no gradient.
+    fn filter5x5(x: FloatTensor<Self>, logits: FloatTensor<Self>) -> FloatTensor<Self>;
+    /// A filtered image with its blend weight, and a coarser image.
+    fn blend(filtered: FloatTensor<Self>, coarse: FloatTensor<Self>) -> FloatTensor<Self>;
     /// With the given statistics; not differentiable.
     fn batch_norm(
         x: FloatTensor<Self>,
@@ -127,19 +140,36 @@ pub(super) fn fuse(
 ) -> Tensor<4> {
     let (weight, bias) = (weight.into_dispatch(), bias.into_dispatch());
     let relu = activation.is_relu();
-    let parts: Vec<_> = parts.into_iter().map(Tensor::into_dispatch).collect();
-    let fused = match <[_; 2]>::try_from(parts) {
-        Ok([a, b]) => Dispatch::fuse_two(a, b, weight, bias, relu),
-        Err(parts) => match <[_; 3]>::try_from(parts) {
-            Ok([a, b, c]) => Dispatch::fuse_three(a, b, c, weight, bias, relu),
-            Err(parts) => panic!("{} parts: a fusion has two or three", parts.len()),
-        },
+    let mut parts = parts.into_iter().map(Tensor::into_dispatch);
+    let fused = match [parts.next(), parts.next(), parts.next(), parts.next()] {
+        [Some(a), None, None, None] => Dispatch::fuse_one(a, weight, bias, relu),
+        [Some(a), Some(b), None, None] => Dispatch::fuse_two(a, b, weight, bias, relu),
+        [Some(a), Some(b), Some(c), None] => Dispatch::fuse_three(a, b, c, weight, bias, relu),
+        _ => panic!("a fusion has one to three parts"),
     };
     Tensor::from_dispatch(fused)
 }
 
 pub(super) fn max_pool(x: Tensor<4>) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::max_pool(x.into_dispatch()))
+}
+
+pub(super) fn halve(x: Tensor<4>) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::halve(x.into_dispatch()))
+}
+
+pub(super) fn filter5x5(x: Tensor<4>, logits: Tensor<4>) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::filter5x5(
+        x.into_dispatch(),
+        logits.into_dispatch(),
+    ))
+}
+
+pub(super) fn blend(filtered: Tensor<4>, coarse: Tensor<4>) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::blend(
+        filtered.into_dispatch(),
+        coarse.into_dispatch(),
+    ))
 }
 
 pub(super) fn batch_norm(x: Tensor<4>, norm: &BatchNorm, activation: Activation) -> Tensor<4> {

@@ -13,7 +13,7 @@ use burn::backend::autodiff::ops::{Backward, NodeGuard, Ops, OpsKind};
 use burn::backend::flex::FlexTensor;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, AutodiffBackend, Flex};
-use demc_kernels::{Isa, batch_norm, pool};
+use demc_kernels::{Isa, batch_norm, blend, filter5x5, pool};
 
 use super::forward::{fuse, rel_mse_into};
 use super::{KernelOps, buffer, contiguous, dims, grid, maps, tensor, values};
@@ -52,6 +52,11 @@ impl<C: CheckpointStrategy> KernelOps for Autodiff<Flex, C> {
         })
     }
 
+    fn fuse_one(a: Tracked, weight: Tracked, bias: Tracked, relu: bool) -> Tracked {
+        let ([a, weight, bias], nodes) = parts([a, weight, bias]);
+        fuse_recorded::<C, 1, 3>([a], weight, bias, nodes, relu)
+    }
+
     fn fuse_two(a: Tracked, b: Tracked, weight: Tracked, bias: Tracked, relu: bool) -> Tracked {
         let ([a, b, weight, bias], nodes) = parts([a, b, weight, bias]);
         fuse_recorded::<C, 2, 4>([a, b], weight, bias, nodes, relu)
@@ -72,6 +77,23 @@ impl<C: CheckpointStrategy> KernelOps for Autodiff<Flex, C> {
     fn max_pool(x: Tracked) -> Tracked {
         let ([x], nodes) = parts([x]);
         record::<_, C, _>(MaxPool, nodes, Flex::max_pool(x.clone()), |_| x)
+    }
+
+    fn halve(x: Tracked) -> Tracked {
+        <Self as AutodiffBackend>::from_inner(Flex::halve(x.into_primitive()))
+    }
+
+    fn filter5x5(x: Tracked, logits: Tracked) -> Tracked {
+        let x = contiguous(x.into_primitive());
+        let ([logits], nodes) = parts([logits]);
+        let y = Flex::filter5x5(x.clone(), logits.clone());
+        record::<_, C, _>(Filter5x5, nodes, y, |_| [x, logits])
+    }
+
+    fn blend(filtered: Tracked, coarse: Tracked) -> Tracked {
+        let (inputs, nodes) = parts([filtered, coarse]);
+        let [filtered, coarse] = inputs.clone();
+        record::<_, C, _>(Blend, nodes, Flex::blend(filtered, coarse), |_| inputs)
     }
 
     fn batch_norm(
@@ -180,6 +202,49 @@ impl Backward<Flex, 1> for MaxPool {
             let mut dx = buffer(values(&x).len());
             pool::backward(Isa::current(), grid, values(&x), values(&dy), &mut dx);
             grads.register::<Flex>(node.id, maps(grid, dx));
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Filter5x5;
+
+impl Backward<Flex, 1> for Filter5x5 {
+    /// The image and the logits.
+    type State = [FlexTensor; 2];
+
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = contiguous(grads.consume::<Flex>(&ops.node));
+        let ([node], [x, logits]) = (ops.parents, ops.state);
+        if let Some(node) = node {
+            let (grid, _) = grid(&x);
+            let mut dlogits = buffer(values(&logits).len());
+            let (image, logits, dy) = (values(&x), values(&logits), values(&dy));
+            filter5x5::backward(Isa::current(), grid, image, logits, dy, &mut dlogits);
+            grads.register::<Flex>(node.id, maps(grid, dlogits));
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Blend;
+
+impl Backward<Flex, 2> for Blend {
+    /// The filtered image with its blend weight, and the coarser image.
+    type State = [FlexTensor; 2];
+
+    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dout = contiguous(grads.consume::<Flex>(&ops.node));
+        let [filtered, coarse] = ops.state.each_ref().map(values);
+        let (grid, _) = grid(&ops.state[0]);
+        let mut gradients = [buffer(filtered.len()), buffer(coarse.len())];
+        let [dfiltered, dcoarse] = &mut gradients;
+        blend::backward(grid, filtered, coarse, values(&dout), dfiltered, dcoarse);
+        let grids = [grid, grid.halved()];
+        for ((node, gradient), grid) in ops.parents.into_iter().zip(gradients).zip(grids) {
+            if let Some(node) = node {
+                grads.register::<Flex>(node.id, maps(grid, gradient));
+            }
         }
     }
 }

@@ -1,0 +1,135 @@
+//! The kernel head (`crate::kernel_head`) on slices, level by level. Only the logits of a band of
+//! rows are in memory.
+
+use std::ops::Range;
+
+use burn::backend::flex::FlexTensor;
+use demc_kernels::conv1x1::{self, Epilogue};
+use demc_kernels::{Grid, Isa, blend, filter5x5, grid, memory, power};
+
+use super::band::bands;
+use super::folded::FoldedConv;
+use super::{FeatureMaps, InferencePass};
+use crate::config::COLOR_CHANNELS;
+use crate::denoiser::Denoiser;
+use crate::kernel_head::{DARKEST, GAMMA, KERNEL_LEVELS};
+
+pub(super) struct KernelHead {
+    isa: Isa,
+    /// The convolutions to logits, from the full resolution down.
+    convs: Vec<FoldedConv>,
+    /// The noisy image in linear light, from the full resolution down.
+    scales: Vec<FeatureMaps>,
+    /// The output of the levels so far.
+    out: Option<FeatureMaps>,
+}
+
+impl KernelHead {
+    /// The head of `model` for planar images in gamma space; `None` for another head.
+    pub(super) fn new(isa: Isa, model: &Denoiser, grid: Grid, color: &FlexTensor) -> Option<Self> {
+        if model.decoder.head.is_some() {
+            return None;
+        }
+        let kernels = model.decoder.kernels.iter().rev();
+        let mut image = FeatureMaps::new(grid, COLOR_CHANNELS);
+        grid::nhwc_from_nchw(grid, color.storage::<f32>(), &mut image.values);
+        power::positive_powers(isa, &mut image.values, GAMMA);
+        let mut scales = vec![image];
+        for _ in 1..KERNEL_LEVELS {
+            let above = &scales[scales.len() - 1];
+            let mut image = FeatureMaps::new(above.grid.halved(), COLOR_CHANNELS);
+            blend::halve(above.grid, &above.values, &mut image.values);
+            scales.push(image);
+        }
+        Some(KernelHead {
+            isa,
+            convs: kernels.map(|conv| FoldedConv::conv(conv, None)).collect(),
+            scales,
+            out: None,
+        })
+    }
+
+    /// The image of a level to be filtered into.
+    pub(super) fn filtered(&self, level: usize) -> FeatureMaps {
+        let channels = COLOR_CHANNELS + self.convs[level].outputs() - filter5x5::TAPS;
+        FeatureMaps::new(self.scales[level].grid, channels)
+    }
+
+    /// Filters some rows of an image; `decoded` are these rows of the decoder's map.
+    pub(super) fn filter_rows(
+        &self,
+        level: usize,
+        image: usize,
+        rows: Range<usize>,
+        decoded: &[f32],
+        filtered: &mut FeatureMaps,
+    ) {
+        let (conv, scale) = (&self.convs[level], &self.scales[level]);
+        let band = scale.band(rows.len());
+        let mut logits = memory::buffer(band.pixels() * conv.outputs());
+        let epilogue = Epilogue {
+            bias: Some(conv.bias()),
+            relu: false,
+            add: false,
+        };
+        conv1x1::part(
+            self.isa,
+            band,
+            &[decoded],
+            conv.weight(),
+            0,
+            epilogue,
+            &mut logits,
+        );
+        let whole = 0..scale.grid.height;
+        let x = scale.rows(image, whole);
+        let grid = scale.band(scale.grid.height);
+        let target = filtered.rows_mut(image, rows.clone());
+        filter5x5::forward_rows(self.isa, grid, x, rows, &logits, target);
+    }
+
+    /// Completes a level: blends the filtered image with the output so far.
+    pub(super) fn blend(&mut self, filtered: FeatureMaps) {
+        self.out = Some(match self.out.take() {
+            None => filtered,
+            Some(coarse) => {
+                let mut out = FeatureMaps::new(filtered.grid, COLOR_CHANNELS);
+                let values = (&filtered.values, &coarse.values);
+                blend::forward(filtered.grid, values.0, values.1, &mut out.values);
+                out
+            }
+        });
+    }
+
+    /// The output in gamma space, planar.
+    pub(super) fn finish(self) -> Vec<f32> {
+        let mut out = self.out.expect("all levels are filtered");
+        for value in &mut out.values {
+            if *value <= DARKEST {
+                *value = 0.0;
+            }
+        }
+        power::positive_powers(self.isa, &mut out.values, 1.0 / GAMMA);
+        let mut planar = memory::buffer(out.values.len());
+        grid::nchw_from_nhwc(out.grid, &out.values, &mut planar);
+        planar
+    }
+}
+
+impl InferencePass<'_> {
+    /// Filters a level, if it has kernels; `decoded` is the decoder's map.
+    pub(super) fn filter_level(&self, head: &mut KernelHead, level: usize, decoded: &FeatureMaps) {
+        if level >= KERNEL_LEVELS {
+            return;
+        }
+        let mut filtered = head.filtered(level);
+        let Grid { batch, height, .. } = decoded.grid;
+        for image in 0..batch {
+            for rows in bands(height, self.plan.band) {
+                let decoded = decoded.rows(image, rows.clone());
+                head.filter_rows(level, image, rows, decoded, &mut filtered);
+            }
+        }
+        head.blend(filtered);
+    }
+}

@@ -1,0 +1,71 @@
+//! Kernels per pixel and the blend of two scales, with Burn's tensor operations. Images are
+//! `[B, C, H, W]`; `demc_kernels` has the definitions.
+
+use burn::tensor::module::avg_pool2d;
+use burn::tensor::ops::AvgPoolOptions;
+use burn::tensor::{Tensor, activation};
+
+/// Side of a kernel, in pixels.
+const SIDE: usize = 5;
+/// Channels of an image.
+const COLORS: usize = 3;
+
+/// See [`demc_kernels::blend::halve`].
+pub(super) fn halve(x: Tensor<4>) -> Tensor<4> {
+    avg_pool2d(x, AvgPoolOptions::new([2, 2]))
+}
+
+/// See [`demc_kernels::filter5x5::forward`].
+pub(super) fn filter5x5(x: Tensor<4>, logits: Tensor<4>) -> Tensor<4> {
+    let [_, channels, height, width] = logits.dims();
+    let taps = SIDE * SIDE;
+    let kernels = activation::softmax(logits.clone().narrow(1, 0, taps), 1);
+    let padded = replicated(replicated(x.detach(), 2), 3);
+    let tap = |tap: usize| {
+        let image = padded.clone().narrow(2, tap / SIDE, height);
+        image.narrow(3, tap % SIDE, width) * kernels.clone().narrow(1, tap, 1)
+    };
+    let filtered = (1..taps).fold(tap(0), |sum, i| sum + tap(i));
+    match channels > taps {
+        true => Tensor::cat(
+            vec![filtered, activation::sigmoid(logits.narrow(1, taps, 1))],
+            1,
+        ),
+        false => filtered,
+    }
+}
+
+/// See [`demc_kernels::blend::forward`].
+pub(super) fn blend(filtered: Tensor<4>, coarse: Tensor<4>) -> Tensor<4> {
+    let image = filtered.clone().narrow(1, 0, COLORS);
+    let weight = filtered.narrow(1, COLORS, 1);
+    let correction = coarse - halve(image.clone());
+    image + weight * doubled(doubled(correction, 2), 3)
+}
+
+/// The image with its first and last row or column twice more.
+fn replicated(x: Tensor<4>, axis: usize) -> Tensor<4> {
+    let last = x.dims()[axis] - 1;
+    let [first, end] = [0, last].map(|index| x.clone().narrow(axis, index, 1));
+    let parts = vec![first.clone(), first, x, end.clone(), end];
+    Tensor::cat(parts, axis)
+}
+
+/// Twice the length along an axis, bilinear with half-pixel centres.
+fn doubled(x: Tensor<4>, axis: usize) -> Tensor<4> {
+    let mut shape = x.dims();
+    let length = shape[axis];
+    let [first, end] = [0, length - 1].map(|index| x.clone().narrow(axis, index, 1));
+    let (before, after) = match length {
+        1 => (x.clone(), x.clone()),
+        _ => (
+            Tensor::cat(vec![first, x.clone().narrow(axis, 0, length - 1)], axis),
+            Tensor::cat(vec![x.clone().narrow(axis, 1, length - 1), end], axis),
+        ),
+    };
+    let near = x.mul_scalar(0.75);
+    let even = near.clone() + before.mul_scalar(0.25);
+    let odd = near + after.mul_scalar(0.25);
+    shape[axis] = 2 * length;
+    Tensor::stack::<5>(vec![even, odd], axis + 1).reshape(shape)
+}
