@@ -37,7 +37,6 @@ fn check() {
     let device = Device::flex();
     // In the order of their sizes: only the process's peak so far is known.
     let cases = [
-        (Variant::ColorOnly, Reading::Released, 16, EVEN, [256, 512]),
         (Variant::Demc, Reading::Paper, 24, PAPER, [512, 512]),
         (Variant::DemcNosn, Reading::Paper, 24, PAPER, [1024, 512]),
         (Variant::Demc, Reading::Released, 24, PAPER, [768, 1024]),

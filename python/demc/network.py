@@ -28,7 +28,15 @@ BN_MOMENTUM = 0.01
 OPEN_BIAS = 1.0
 """Initial bias of the detail map's last convolution if `detail` is "open" (ours)."""
 GREY_HEAD_SCALE = 0.1
-"""Factor of the head's Xavier weights if `head` is "grey" (ours)."""
+"""Factor of the head's Xavier weights if `head` is "grey" or "kernel" (ours)."""
+KERNEL_LEVELS = 4
+"""Levels at which a kernel head filters, from the full resolution down."""
+KERNEL_TAPS = 25
+"""Weights of a 5x5 kernel."""
+KERNEL_GAMMA = 2.2
+"""Exponent of the colour compression that a kernel head undoes."""
+DARKEST = 1e-8
+"""Smaller outputs of a kernel head, in linear light, count as black."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +79,7 @@ READINGS = {
 class ModelConfig:
     """The `model` part of a bundle's metadata.
 
-    `head` and `detail` only affect the initialisation.
+    `head` "kernel" predicts kernels (`kernel_head`). "grey" and "xavier", and `detail`, are initialisations.
     """
 
     variant: str = "demc"
@@ -85,7 +93,7 @@ class ModelConfig:
         for what, value, known in (
             ("variant", self.variant, VARIANTS),
             ("reading", self.reading, READINGS),
-            ("head", self.head, ("grey", "xavier")),
+            ("head", self.head, ("grey", "xavier", "kernel")),
             ("detail", self.detail, ("open", "xavier")),
         ):
             if value not in known:
@@ -246,19 +254,57 @@ class DecoderLevel(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Five levels, the deepest first, and the head (conv3x3 to 3 channels, ReLU)."""
+    """Five levels, the deepest first, and the head: conv3x3 to 3 channels and ReLU, or `kernel_head`."""
 
-    def __init__(self, levels: Sequence[int], encoders: int, reading: Reading) -> None:
+    def __init__(self, levels: Sequence[int], encoders: int, reading: Reading, head: str) -> None:
         super().__init__()
         widths = [levels[-1], *reversed(levels)]
         self.levels = nn.ModuleList(DecoderLevel(a, b, encoders, reading) for a, b in zip(widths, widths[1:]))
-        self.head = conv3x3(levels[0], 3)
+        self.head, self.kernels = None, nn.ModuleList()
+        if head == "kernel":
+            for level in reversed(range(KERNEL_LEVELS)):
+                logits = KERNEL_TAPS + (level + 1 < KERNEL_LEVELS)
+                self.kernels.append(nn.Conv2d(levels[level], logits, 1))
+        else:
+            self.head = conv3x3(levels[0], 3)
 
-    def forward(self, latent: Tensor, skips: Sequence[Sequence[Tensor]]) -> Tensor:
+    def forward(self, latent: Tensor, skips: Sequence[Sequence[Tensor]], color_gamma: Tensor) -> Tensor:
         """The latent, and the five skips of each encoder, full resolution first -> [B, 3, H, W], >= 0."""
+        decoded = []
         for level, level_skips in zip(self.levels, reversed(list(zip(*skips)))):
             latent = level(latent, level_skips)
-        return F.relu(self.head(latent))
+            decoded.append(latent)
+        if self.head is not None:
+            return F.relu(self.head(latent))
+        logits = [conv(x) for conv, x in zip(self.kernels, decoded[-KERNEL_LEVELS:])]
+        return kernel_head(logits, color_gamma)
+
+
+def kernel_head(logits: Sequence[Tensor], color_gamma: Tensor) -> Tensor:
+    """Filters the noisy colour with predicted kernels on four scales (Bako et al. 2017, Vogels et al. 2018).
+
+    `logits` are [B, 25, H/8, W/8], then [B, 26, H/4, W/4] to [B, 26, H, W]: a 5x5 kernel, and the weight with which the
+    level below replaces low frequencies. Colour and output are [B, 3, H, W] in gamma space.
+    """
+    images = [color_gamma.detach().clamp_min(0) ** KERNEL_GAMMA]
+    for _ in logits[1:]:
+        images.append(F.avg_pool2d(images[-1], 2))
+    out = None
+    for level_logits, image in zip(logits, reversed(images)):
+        filtered = filter5x5(image, level_logits[:, :KERNEL_TAPS].softmax(1))
+        if out is not None:
+            correction = F.interpolate(out - F.avg_pool2d(filtered, 2), scale_factor=2, mode="bilinear")
+            filtered = filtered + level_logits[:, KERNEL_TAPS:].sigmoid() * correction
+        out = filtered
+    return out.clamp_min(DARKEST) ** (1 / KERNEL_GAMMA) * (out > DARKEST)
+
+
+def filter5x5(image: Tensor, kernels: Tensor) -> Tensor:
+    """The mean of each pixel's 5x5 neighbours with its own weights [B, 25, H, W]; the border is replicated."""
+    height, width = image.shape[-2:]
+    padded = F.pad(image, (2, 2, 2, 2), mode="replicate")
+    windows = (padded[..., i // 5 : i // 5 + height, i % 5 : i % 5 + width] for i in range(KERNEL_TAPS))
+    return sum(window * kernels[:, i : i + 1] for i, window in enumerate(windows))
 
 
 class Denoiser(nn.Module):
@@ -281,7 +327,7 @@ class Denoiser(nn.Module):
             for e, inputs in enumerate(self.variant.encoders)
         )
         self.latent = Latent(levels[-1], reading)
-        self.decoder = Decoder(levels, last + 1, reading)
+        self.decoder = Decoder(levels, last + 1, reading, config.head)
         self._initialise(head_bias)
 
     def forward(self, color_gamma: Tensor, features_z: Tensor) -> Tensor:
@@ -296,7 +342,7 @@ class Denoiser(nn.Module):
         for encoder, names in zip(self.encoders, self.variant.encoders):
             encoder_skips, pooled = encoder(torch.cat([planes[name] for name in names], 1))
             skips.append(encoder_skips)
-        return self.decoder(self.latent(pooled), skips)
+        return self.decoder(self.latent(pooled), skips, color_gamma)
 
     def detail_map(self, features_z: Tensor) -> Tensor | None:
         """[B, 12, H, W] -> [B, 3, H, W] (Fig. 2 e); None if the variant has no fusion sub-network."""
@@ -314,6 +360,8 @@ class Denoiser(nn.Module):
         for level in self.decoder.levels:
             channels, inputs = level.fuse.weight.shape[:2]
             level.fuse.weight.copy_(torch.eye(channels).repeat(1, inputs // channels)[:, :, None, None])
+        for conv in self.decoder.kernels:
+            conv.weight.mul_(GREY_HEAD_SCALE)
         if self.config.head == "grey":
             self.decoder.head.weight.mul_(GREY_HEAD_SCALE)
             self.decoder.head.bias.copy_(torch.tensor(head_bias))

@@ -24,7 +24,9 @@ use demc_model::LossConfig;
 use demc_model::ops::{Isa, Ops};
 use demc_model::{Reading, Variant};
 
-use fixture::{Fixture, gradients_by_name, host, is_bias_before_norm, network, network_name};
+use fixture::{
+    Fixture, config, gradients_by_name, host, is_bias_before_norm, network, network_name,
+};
 use tensors::{Tolerance, assert_close};
 
 /// Two float32 roundings of 27 layers on the CPU; a GPU fuses and orders its sums differently.
@@ -90,9 +92,9 @@ fn run(backend: &Backend, variant: Variant, reading: Reading) -> BTreeMap<String
         Isa::force(isa);
     }
     let inputs = Fixture::read("inputs");
-    let weights = Fixture::read(&network_name(variant, reading));
+    let weights = Fixture::read(&network_name(&config(variant, reading)));
     let device = backend.device.clone().autodiff();
-    let model = network(variant, reading, &weights, &device).with_ops(backend.ops);
+    let model = network(&config(variant, reading), &weights, &device).with_ops(backend.ops);
     let images = |device| ["color_gamma", "features_z"].map(|name| inputs.tensor(name, device));
 
     let [color_gamma, features_z] = images(&backend.device);
@@ -146,7 +148,7 @@ fn all_backends_agree() {
                 }
                 println!(
                     "{}, {}: share of the tolerances {worst:.3}",
-                    network_name(variant, reading),
+                    network_name(&config(variant, reading)),
                     backend.name
                 );
             }

@@ -5,7 +5,8 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use demc_data::frame::FEATURE_NAMES;
-use demc_model::Weight;
+use demc_model::kernel_head::GAMMA;
+use demc_model::{Head, Weight};
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, Metadata};
 use serde::Deserialize;
@@ -194,6 +195,12 @@ fn statistics_problems(meta: &BundleMeta) -> Vec<String> {
     {
         problems.push(format!(
             "normalizer.demodulate: {epsilon} is not 0 or above"
+        ));
+    }
+    if meta.model.head == Head::Kernel && normalizer.gamma != GAMMA {
+        problems.push(format!(
+            "normalizer.gamma: {} is not {GAMMA}, as a kernel head needs",
+            normalizer.gamma
         ));
     }
     let features = &normalizer.features;

@@ -6,7 +6,7 @@ use half::f16;
 use half::slice::HalfFloatSliceExt;
 
 use super::proto::{
-    AttributeProto, FLOAT, FLOAT16, GraphProto, INT, INT64, INTS, NodeProto, TensorProto,
+    AttributeProto, FLOAT, FLOAT16, GraphProto, INT, INT64, INTS, NodeProto, STRING, TensorProto,
 };
 use crate::Precision;
 use crate::bundle::tensors::f32_bytes;
@@ -20,6 +20,7 @@ pub(super) type Attributes<'a> = &'a [(&'a str, AttributeValue<'a>)];
 pub(super) enum AttributeValue<'a> {
     Int(i64),
     Ints(&'a [usize]),
+    Text(&'a str),
 }
 
 pub(super) struct GraphBuilder {
@@ -57,19 +58,25 @@ impl GraphBuilder {
         attributes: Attributes,
     ) -> Value {
         let attribute = attributes.iter().map(|(name, value)| {
-            let (i, ints, r#type) = match value {
-                AttributeValue::Int(i) => (Some(*i), Vec::new(), INT),
+            let mut attribute = AttributeProto {
+                name: name.to_string(),
+                ..AttributeProto::default()
+            };
+            attribute.r#type = match value {
+                AttributeValue::Int(i) => {
+                    attribute.i = Some(*i);
+                    INT
+                }
                 AttributeValue::Ints(ints) => {
-                    (None, ints.iter().map(|&i| i as i64).collect(), INTS)
+                    attribute.ints = ints.iter().map(|&i| i as i64).collect();
+                    INTS
+                }
+                AttributeValue::Text(text) => {
+                    attribute.s = text.as_bytes().to_vec();
+                    STRING
                 }
             };
-            let name = name.to_string();
-            AttributeProto {
-                name,
-                i,
-                ints,
-                r#type,
-            }
+            attribute
         });
         self.nodes.push(NodeProto {
             input: inputs.iter().map(|value| value.0.clone()).collect(),

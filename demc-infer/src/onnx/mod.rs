@@ -19,6 +19,7 @@
 //! types, so a newer set would only exclude older runtimes.
 
 mod graph;
+mod kernel_head;
 mod network;
 mod proto;
 

@@ -55,12 +55,19 @@ impl GraphBuilder {
         }
         let bottom = bottom.expect("the last encoder feeds the latent");
         let mut x = self.block(&bottom, &model.latent);
+        let mut decoded = Vec::new();
         for level in &model.decoder.levels {
             let skips = skips.iter_mut().filter_map(Vec::pop).collect();
             x = self.ascend(&x, skips, level);
+            decoded.push(x.clone());
         }
-        let image = self.conv(&x, &model.decoder.head, None);
-        let mut image = self.node("Relu", "output_gamma", &[&image], &[]);
+        let mut image = match &model.decoder.head {
+            Some(head) => {
+                let image = self.conv(&x, head, None);
+                self.node("Relu", "output_gamma", &[&image], &[])
+            }
+            None => self.kernel_head(&model.decoder.kernels, &decoded, &color_gamma),
+        };
         if let Some(modulation) = &modulation {
             image = self.node("Mul", "output_modulated", &[&image, modulation], &[]);
         }
@@ -167,7 +174,7 @@ impl GraphBuilder {
         }
     }
 
-    fn conv(&mut self, x: &Value, conv: &Conv2d, norm: Option<&BatchNorm>) -> Value {
+    pub(super) fn conv(&mut self, x: &Value, conv: &Conv2d, norm: Option<&BatchNorm>) -> Value {
         let spec = self.spec(conv.weight.id);
         let layers = [None, norm].map(|norm| FoldedConv::conv(conv, norm));
         let [weight, bias] = self.layer(&spec, layers, norm);

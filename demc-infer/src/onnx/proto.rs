@@ -102,7 +102,7 @@ pub struct NodeProto {
     pub attribute: Vec<AttributeProto>,
 }
 
-/// `AttributeProto` of one integer or several.
+/// `AttributeProto` of one integer, several, or a text.
 #[derive(Clone, PartialEq, Message)]
 pub struct AttributeProto {
     /// Its name.
@@ -111,16 +111,21 @@ pub struct AttributeProto {
     /// The value of a single integer.
     #[prost(int64, optional, tag = "3")]
     pub i: Option<i64>,
+    /// The value of a text.
+    #[prost(bytes = "vec", tag = "4")]
+    pub s: Vec<u8>,
     /// The values of several integers.
     #[prost(int64, repeated, packed = "false", tag = "8")]
     pub ints: Vec<i64>,
-    /// [`INT`] or [`INTS`].
+    /// [`INT`], [`STRING`] or [`INTS`].
     #[prost(int32, tag = "20")]
     pub r#type: i32,
 }
 
 /// [`AttributeProto::type`] of one integer.
 pub const INT: i32 = 2;
+/// [`AttributeProto::type`] of a text.
+pub const STRING: i32 = 3;
 /// [`AttributeProto::type`] of several integers.
 pub const INTS: i32 = 7;
 

@@ -2,7 +2,9 @@
 
 use std::collections::HashSet;
 
-use demc_model::Variant;
+use demc_model::{Head, Variant};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
 
 use super::proto::{FLOAT16, GraphProto, NodeProto};
 use super::*;
@@ -10,6 +12,16 @@ use crate::bundle::testing::bundle;
 
 fn graph(variant: Variant, precision: Precision) -> GraphProto {
     let model = bundle(variant).onnx(precision).expect("a graph");
+    model.graph.expect("there is one")
+}
+
+fn kernel_graph(variant: Variant) -> GraphProto {
+    let mut bundle = bundle(variant);
+    bundle.meta.model.head = Head::Kernel;
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    let device = burn::tensor::Device::flex();
+    bundle.model = bundle.meta.model.init(&mut rng, [0.5; 3], &device);
+    let model = bundle.onnx(Precision::F32).expect("a graph");
     model.graph.expect("there is one")
 }
 
@@ -21,21 +33,25 @@ fn count(graph: &GraphProto, op: &str) -> usize {
 fn every_value_is_defined_once_and_before_its_use() {
     for variant in Variant::ALL {
         for precision in [Precision::F32, Precision::F16] {
-            let graph = graph(variant, precision);
-            let mut known: HashSet<&str> = graph.input.iter().map(|v| v.name.as_str()).collect();
-            for constant in &graph.initializer {
-                assert!(known.insert(&constant.name), "{} twice", constant.name);
-            }
-            for NodeProto { input, output, .. } in &graph.node {
-                for name in input {
-                    assert!(known.contains(name.as_str()), "{name} is not defined yet");
+            for graph in [graph(variant, precision), kernel_graph(variant)] {
+                let mut known: HashSet<&str> =
+                    graph.input.iter().map(|v| v.name.as_str()).collect();
+                for constant in &graph.initializer {
+                    assert!(known.insert(&constant.name), "{} twice", constant.name);
                 }
-                assert!(known.insert(&output[0]), "{} twice", output[0]);
-            }
-            assert!(known.contains(OUTPUT));
-            let taken: HashSet<&String> = graph.node.iter().flat_map(|n| &n.input).collect();
-            for constant in &graph.initializer {
-                assert!(taken.contains(&constant.name), "{} unused", constant.name);
+                for NodeProto { input, output, .. } in &graph.node {
+                    for name in input {
+                        // Resize has an empty input.
+                        let is_known = name.is_empty() || known.contains(name.as_str());
+                        assert!(is_known, "{name} is not defined yet");
+                    }
+                    assert!(known.insert(&output[0]), "{} twice", output[0]);
+                }
+                assert!(known.contains(OUTPUT));
+                let taken: HashSet<&String> = graph.node.iter().flat_map(|n| &n.input).collect();
+                for constant in &graph.initializer {
+                    assert!(taken.contains(&constant.name), "{} unused", constant.name);
+                }
             }
         }
     }

@@ -19,7 +19,8 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use demc_data::DataConfig;
-use demc_model::{LossConfig, ModelConfig, Variant};
+use demc_model::kernel_head::GAMMA;
+use demc_model::{Head, LossConfig, ModelConfig, Variant};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 use toml::Value;
@@ -170,6 +171,12 @@ impl Config {
             problems.push(format!(
                 "data.albedo_demodulation_epsilon = {epsilon:?}: must be absent for color-only, the control \
                  without features; --set data.albedo_demodulation_epsilon= removes it"
+            ));
+        }
+        if self.model.head == Head::Kernel && self.data.gamma != GAMMA {
+            problems.push(format!(
+                "data.gamma = {:?}: must be {GAMMA:?} for model.head = \"kernel\"",
+                self.data.gamma
             ));
         }
         problems

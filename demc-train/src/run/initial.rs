@@ -104,8 +104,12 @@ pub fn read_init(config: &Config) -> anyhow::Result<Option<BundleFile>> {
     let file = BundleFile::read(init).context("train.init")?;
     let mut saved = config.clone();
     // Its own initialisation does not matter.
+    let theirs = file.meta.model.head;
     saved.model = ModelConfig {
-        head: config.model.head,
+        head: match theirs.has_weights_of(config.model.head) {
+            true => config.model.head,
+            false => theirs,
+        },
         detail: config.model.detail,
         ..file.meta.model
     };

@@ -132,7 +132,9 @@ impl Optimizer {
     pub fn dormant(&self) -> DormantChannels {
         let mut count = DormantChannels::default();
         let biases = self.specs.iter();
-        for spec in biases.filter(|spec| spec.role == Role::Bias && !matches!(spec.stage, Stage::Head { .. })) {
+        for spec in biases
+            .filter(|spec| spec.role == Role::Bias && !matches!(spec.stage, Stage::Head { .. }))
+        {
             let Some(WeightState::Adam(moments)) = self.states.get(&spec.name) else {
                 continue;
             };

@@ -12,7 +12,7 @@ use burn::tensor::Device;
 use demc_data::{ChannelLayout, FeatureStats, Normalizer, PositionSpace};
 use demc_infer::{Bundle, BundleMeta};
 use demc_model::config::LEVEL_WIDTHS;
-use demc_model::{ModelConfig, Reading, Variant, Weight, Weights};
+use demc_model::{Head, ModelConfig, Reading, Variant, Weight, Weights};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
@@ -99,6 +99,12 @@ pub fn random_bundle(
         levels: match rng.random() {
             true => LEVEL_WIDTHS,
             false => [2, 1, 3, 2, 4],
+        },
+        // Each head with and without a fusion, in both readings.
+        head: match (variant, reading) {
+            (Variant::Semc | Variant::ColorOnly, Reading::Released) => Head::Kernel,
+            (Variant::DemcNosn, Reading::Paper) => Head::Kernel,
+            _ => Head::Grey,
         },
         ..ModelConfig::default()
     };

@@ -12,7 +12,7 @@ use demc_model::ops::{self, Activation, Maps};
 use demc_model::{Denoiser, Reading, Variant};
 
 use crate::fixture::{
-    Fixture, gradients_by_name, host, is_bias_before_norm, network, network_name,
+    Fixture, config, gradients_by_name, host, is_bias_before_norm, network, network_name,
 };
 use crate::tensors::{Tolerance, assert_close};
 use crate::{GRADIENT, OUTPUT};
@@ -71,7 +71,10 @@ fn head_is_pytorchs() {
     let forward: BlockForward = |model, inputs| {
         inputs
             .into_iter()
-            .map(|x| x.conv3x3(&model.decoder.head, Activation::None))
+            .map(|x| {
+                let head = model.decoder.head.as_ref().expect("a convolution");
+                x.conv3x3(head, Activation::None)
+            })
             .collect()
     };
     in_both_readings("decoder.head", forward);
@@ -129,7 +132,7 @@ fn in_both_readings(path: &str, forward: BlockForward) {
 }
 
 fn check(fixture: &Fixture, reading: Reading, path: &str, forward: BlockForward) -> String {
-    let weights = Fixture::read(&network_name(Variant::Demc, reading));
+    let weights = Fixture::read(&network_name(&config(Variant::Demc, reading)));
     let prefix = format!("{}/{path}", reading.spec().name);
     let outputs_close = |mode: &str, outputs: &[Tensor<4>]| {
         let expected = fixture.list(&format!("{prefix}/{mode}"), &crate::device());
@@ -147,7 +150,7 @@ fn check(fixture: &Fixture, reading: Reading, path: &str, forward: BlockForward)
     };
 
     let device = crate::device();
-    let model = network(Variant::Demc, reading, &weights, &device);
+    let model = network(&config(Variant::Demc, reading), &weights, &device);
     let eval = outputs_close(
         "eval",
         &run(
@@ -158,7 +161,7 @@ fn check(fixture: &Fixture, reading: Reading, path: &str, forward: BlockForward)
     );
 
     let device = device.autodiff();
-    let model = network(Variant::Demc, reading, &weights, &device);
+    let model = network(&config(Variant::Demc, reading), &weights, &device);
     let inputs: Vec<_> = fixture
         .list(&format!("{prefix}/input"), &device)
         .into_iter()

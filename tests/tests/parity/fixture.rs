@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
-use demc_model::{Denoiser, ModelConfig, Reading, Variant, Weight, Weights};
+use demc_model::{Denoiser, Head, ModelConfig, Reading, Variant, Weight, Weights};
 
 use crate::tensors::{self, HostTensor};
 
@@ -67,19 +67,28 @@ impl Fixture {
     }
 }
 
-/// Name of a fixture file.
-pub fn network_name(variant: Variant, reading: Reading) -> String {
-    format!("{}-{}", variant.spec().name, reading.spec().name)
-}
-
-/// The network of a fixture file, on `device`.
-pub fn network(variant: Variant, reading: Reading, fixture: &Fixture, device: &Device) -> Denoiser {
-    let config = ModelConfig {
+/// The configuration of a fixture file.
+pub fn config(variant: Variant, reading: Reading) -> ModelConfig {
+    ModelConfig {
         variant,
         reading,
         width: WIDTH,
         ..ModelConfig::default()
+    }
+}
+
+/// Name of a fixture file.
+pub fn network_name(config: &ModelConfig) -> String {
+    let end = match config.head {
+        Head::Kernel => "-kernel",
+        Head::Grey | Head::Xavier => "",
     };
+    let (variant, reading) = (config.variant.spec().name, config.reading.spec().name);
+    format!("{variant}-{reading}{end}")
+}
+
+/// The network of a fixture file, on `device`.
+pub fn network(config: &ModelConfig, fixture: &Fixture, device: &Device) -> Denoiser {
     let mut weights = Weights::new(fixture.group("weight/"));
     config
         .load(&mut weights, device)

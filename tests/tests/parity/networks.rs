@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use burn::optim::{AdamConfig, GradientsParams};
 use burn::tensor::{Device, Tensor};
 use demc_model::LossConfig;
-use demc_model::{Denoiser, Ops, Reading, Variant, ops};
+use demc_model::{Denoiser, Head, ModelConfig, Ops, Reading, Variant, ops};
 
 use crate::fixture::{
-    Fixture, gradients_by_name, host, is_bias_before_norm, network, network_name,
+    Fixture, config, gradients_by_name, host, is_bias_before_norm, network, network_name,
 };
 use crate::tensors::{Tolerance, assert_close};
 use crate::{GRADIENT, OUTPUT};
@@ -118,19 +118,40 @@ fn color_only_in_the_released_reading_is_pytorchs() {
     check(Variant::ColorOnly, Reading::Released);
 }
 
+#[test]
+fn demc_with_a_kernel_head_in_the_papers_reading_is_pytorchs() {
+    check_network(&ModelConfig {
+        head: Head::Kernel,
+        ..config(Variant::Demc, Reading::Paper)
+    });
+}
+
+#[test]
+fn demc_with_a_kernel_head_in_the_released_reading_is_pytorchs() {
+    check_network(&ModelConfig {
+        head: Head::Kernel,
+        ..config(Variant::Demc, Reading::Released)
+    });
+}
+
 fn check(variant: Variant, reading: Reading) {
-    let name = network_name(variant, reading);
+    check_network(&config(variant, reading));
+}
+
+fn check_network(config: &ModelConfig) {
+    let reading = config.reading;
+    let name = network_name(config);
     let fixture = Fixture::read(&name);
-    let eval = check_eval(variant, reading, &fixture);
+    let eval = check_eval(config, &fixture);
 
     let device = crate::device().autodiff();
     let batch = FixtureBatch::read(&device);
-    let model = network(variant, reading, &fixture, &device);
+    let model = network(config, &fixture, &device);
     let train = check_first_step(&model, &batch, reading, &fixture);
 
     // New models, because the forward pass above changed the running statistics of the first one.
     let stepped = |ops| {
-        let model = network(variant, reading, &fixture, &device).with_ops(ops);
+        let model = network(config, &fixture, &device).with_ops(ops);
         check_adam(model, &batch, reading, &fixture)
     };
     let adam = match ops::process_default().on(&device) {
@@ -144,9 +165,9 @@ fn check(variant: Variant, reading: Reading) {
     println!("{name}: shares of the tolerances: eval {eval:.3}, {train}, {adam}");
 }
 
-fn check_eval(variant: Variant, reading: Reading, fixture: &Fixture) -> f32 {
+fn check_eval(config: &ModelConfig, fixture: &Fixture) -> f32 {
     let device = crate::device();
-    let model = network(variant, reading, fixture, &device);
+    let model = network(config, fixture, &device);
     let output = host(FixtureBatch::read(&device).output(&model));
     assert_close(
         "output in eval mode",

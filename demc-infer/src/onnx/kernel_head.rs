@@ -1,0 +1,126 @@
+//! The kernel head (`demc_model::kernel_head`) as a graph.
+//!
+//! ONNX has no operation that filters each pixel with its own kernel. A convolution with one-hot
+//! kernels gathers the 25 neighbours of each pixel; their products with the softmax are summed.
+
+use burn::nn::conv::Conv2d;
+use demc_model::config::COLOR_CHANNELS;
+use demc_model::kernel_head::{DARKEST, GAMMA, KERNEL_LEVELS, KERNEL_LOGITS, logits};
+
+use super::graph::{AttributeValue, GraphBuilder, Value};
+
+/// Side of a kernel, in pixels.
+const SIDE: usize = 5;
+
+impl GraphBuilder {
+    /// The denoised image in gamma space. `decoded` are the decoder's maps, deepest first, and
+    /// `color_gamma` is the network's input colour.
+    pub(super) fn kernel_head(
+        &mut self,
+        kernels: &[Conv2d],
+        decoded: &[Value],
+        color_gamma: &Value,
+    ) -> Value {
+        let gamma = self.constant("kernels.gamma", &[], &[GAMMA]);
+        let mut scales = vec![self.node("Pow", "kernels.image.0", &[color_gamma, &gamma], &[])];
+        for level in 1..KERNEL_LEVELS {
+            let image = scales[level - 1].clone();
+            scales.push(self.halved(&format!("kernels.image.{level}"), &image));
+        }
+        let neighbours = self.neighbours();
+        let decoded = &decoded[decoded.len() - kernels.len()..];
+        let mut out: Option<Value> = None;
+        for (k, (conv, decoded)) in kernels.iter().zip(decoded).enumerate() {
+            let level = KERNEL_LEVELS - 1 - k;
+            let all = self.conv(decoded, conv, None);
+            let weights =
+                self.channels(&all, &format!("kernels.weights.{level}"), 0, KERNEL_LOGITS);
+            let filtered = self.filtered(level, &scales[level], &weights, &neighbours);
+            out = Some(match out {
+                None => filtered,
+                Some(coarse) => {
+                    let name = format!("kernels.blend.{level}");
+                    let blend = self.channels(&all, &name, KERNEL_LOGITS, logits(level));
+                    self.blended(level, &filtered, &coarse, &blend)
+                }
+            });
+        }
+        let out = out.expect("a kernel head has levels");
+        let darkest = self.constant("kernels.darkest", &[], &[DARKEST]);
+        let visible = self.node("Greater", "kernels.visible", &[&out, &darkest], &[]);
+        let target = [("to", AttributeValue::Int(1))];
+        let visible = self.node("Cast", "kernels.visible.f32", &[&visible], &target);
+        let bright = self.node("Max", "kernels.bright", &[&out, &darkest], &[]);
+        let exponent = self.constant("kernels.inverse_gamma", &[], &[1.0 / GAMMA]);
+        let power = self.node("Pow", "kernels.power", &[&bright, &exponent], &[]);
+        self.node("Mul", "output_gamma", &[&power, &visible], &[])
+    }
+
+    /// One-hot kernels `[75, 1, 5, 5]`: the 25 neighbours of each channel.
+    fn neighbours(&mut self) -> Value {
+        let mut values = vec![0.0; COLOR_CHANNELS * KERNEL_LOGITS * SIDE * SIDE];
+        for (kernel, values) in values.chunks_mut(SIDE * SIDE).enumerate() {
+            values[kernel % KERNEL_LOGITS] = 1.0;
+        }
+        let shape = [COLOR_CHANNELS * KERNEL_LOGITS, 1, SIDE, SIDE];
+        self.constant("kernels.neighbours", &shape, &values)
+    }
+
+    /// An image `[B, 3, H, W]`, filtered with the softmax of `[B, 25, H, W]`.
+    fn filtered(&mut self, level: usize, image: &Value, weights: &Value, taps: &Value) -> Value {
+        let name = |what: &str| format!("kernels.{what}.{level}");
+        let axis = [("axis", AttributeValue::Int(1))];
+        let weights = self.node("Softmax", &name("softmax"), &[weights], &axis);
+        let reach = (SIDE / 2) as i64;
+        let pads = self.integers(&name("pads"), &[0, 0, reach, reach, 0, 0, reach, reach]);
+        let edge = [("mode", AttributeValue::Text("edge"))];
+        let padded = self.node("Pad", &name("padded"), &[image, &pads], &edge);
+        let groups = [
+            ("group", AttributeValue::Int(COLOR_CHANNELS as i64)),
+            ("kernel_shape", AttributeValue::Ints(&[SIDE, SIDE])),
+        ];
+        let gathered = self.node("Conv", &name("gathered"), &[&padded, taps], &groups);
+        let taps = KERNEL_LOGITS as i64;
+        let [colors, one] = [("color_shape", COLOR_CHANNELS as i64), ("weight_shape", 1)]
+            .map(|(what, first)| self.integers(&name(what), &[0, first, taps, -1]));
+        let gathered = self.node("Reshape", &name("taps"), &[&gathered, &colors], &[]);
+        let weights = self.node("Reshape", &name("kernel"), &[&weights, &one], &[]);
+        let products = self.node("Mul", &name("products"), &[&gathered, &weights], &[]);
+        let axes = self.integers(&name("axes"), &[2]);
+        let flat = [("keepdims", AttributeValue::Int(0))];
+        let sum = self.node("ReduceSum", &name("sum"), &[&products, &axes], &flat);
+        let shape = self.node("Shape", &name("shape"), &[image], &[]);
+        self.node("Reshape", &name("filtered"), &[&sum, &shape], &[])
+    }
+
+    /// `y + b U(coarse - D(y))`.
+    fn blended(&mut self, level: usize, filtered: &Value, coarse: &Value, blend: &Value) -> Value {
+        let name = |what: &str| format!("kernels.{what}.{level}");
+        let mean = self.halved(&name("mean"), filtered);
+        let correction = self.node("Sub", &name("correction"), &[coarse, &mean], &[]);
+        let scales = self.constant(&name("scales"), &[4], &[1.0, 1.0, 2.0, 2.0]);
+        let linear = [("mode", AttributeValue::Text("linear"))];
+        let region = Value(String::new());
+        let inputs = [&correction, &region, &scales];
+        let doubled = self.node("Resize", &name("doubled"), &inputs, &linear);
+        let share = self.node("Sigmoid", &name("share"), &[blend], &[]);
+        let product = self.node("Mul", &name("corrected"), &[&doubled, &share], &[]);
+        self.node("Add", &name("out"), &[filtered, &product], &[])
+    }
+
+    fn halved(&mut self, name: &str, image: &Value) -> Value {
+        let settings = [
+            ("kernel_shape", AttributeValue::Ints(&[2, 2])),
+            ("strides", AttributeValue::Ints(&[2, 2])),
+        ];
+        self.node("AveragePool", name, &[image], &settings)
+    }
+
+    /// Channels from `first` to `end`.
+    fn channels(&mut self, x: &Value, name: &str, first: usize, end: usize) -> Value {
+        let bounds = [("start", first as i64), ("end", end as i64), ("axis", 1)]
+            .map(|(what, value)| self.integers(&format!("{name}.{what}"), &[value]));
+        let [start, end, axis] = &bounds;
+        self.node("Slice", name, &[x, start, end, axis], &[])
+    }
+}
