@@ -14,6 +14,8 @@ import onnxruntime
 from onnx.tools.update_model_dims import update_inputs_outputs_dims
 
 OPERATORS = {"Relu", "Pow", "Sub", "Div", "Conv", "ConvTranspose", "MaxPool", "Min", "Concat", "Cast", "Mul", "Slice", "Add"}
+KERNEL_HEAD = {"AveragePool", "Greater", "Max", "Pad", "ReduceSum", "Reshape", "Resize", "Shape", "Sigmoid", "Softmax"}
+"""Operators of a kernel head."""
 SHAPES = {"color": ["batch", 3, "height", "width"], "features": ["batch", 12, "height", "width"]}
 OUTPUT = ["batch", 3, "height", "width"]
 
@@ -26,11 +28,13 @@ def check_structure(path: Path) -> None:
     onnx.checker.check_model(str(path), full_check=True)
     model = onnx.load(path)
     assert [(o.domain, o.version) for o in model.opset_import] == [("", 17)]
-    assert {node.op_type for node in model.graph.node} <= OPERATORS
+    operators = {node.op_type for node in model.graph.node}
+    assert operators <= OPERATORS | KERNEL_HEAD
     assert {value.name: shape(value) for value in model.graph.input} == SHAPES
     assert {value.name: shape(value) for value in model.graph.output} == {"output": OUTPUT}
     meta = {entry.key: entry.value for entry in model.metadata_props}
     bundle = json.loads(meta["demc"])
+    assert (operators <= OPERATORS) == (bundle["model"]["head"] != "kernel")
     assert path.stem.startswith(f"{bundle['model']['variant']}-{bundle['model']['reading']}-"), path
     assert bundle["normalizer"]["gamma"] == 2.2 and len(bundle["normalizer"]["features"]["std"]) == 12
     assert len(json.loads(meta["demc.features"])) == 12
