@@ -1,5 +1,6 @@
 #!/bin/sh
-# Trains a model like the bundled one: renders the data, runs the 13 stages, exports the weights.
+# Trains a model like the bundled one: renders the data, runs the 13 stages, trains the albedo filter,
+# exports the weights.
 #
 #   configs/bundled/train.sh [--base DIR]   8 hours of training and 3 hours of rendering on 2 cores
 #   configs/bundled/train.sh --try          2 steps per stage on data/sample, about 1 minute
@@ -62,6 +63,12 @@ stock() {
         --copies 4 --size 192x192 --ref-spp 96
 }
 
+# Renders views of stock renderers for the albedo filter: albedo RENDERER SCENES
+albedo() {
+    [ -e data/bundled/albedo/manifest.json ] && return
+    "$python" tests/renderers/data_set.py "$1" "$2" -o data/bundled/e --size 224x224 --ref-spp 64
+}
+
 # Denoises the references of a data set: clean NAME RENDERED
 clean() {
     [ -e "data/bundled/$1/complete" ] && return
@@ -103,6 +110,14 @@ render_all() {
     stock mitsuba 202-208
     stock luxcore 302-307
     clean clean-d d
+
+    # Albedo filter: those 30 views, 54 others, and 90 rooms and still lifes.
+    albedo cycles 118-139
+    albedo mitsuba 209-224
+    albedo luxcore 308-323
+    render e1 data/bundled/e --rooms 26 --stills 26 --size 192 --grain 0.8 --sun 0.8 --ref-spp 64 --residual 1 --seed 71
+    [ -e data/bundled/albedo/manifest.json ] ||
+        "$python" configs/bundled/albedo_set.py data/bundled/d data/bundled/e data/bundled/e1 -o data/bundled/albedo
 }
 
 # A trial runs in a directory in which every data set is data/sample.
@@ -110,7 +125,7 @@ if [ -n "$steps" ]; then
     rm -rf runs/bundled-try
     mkdir -p runs/bundled-try/data/bundled
     cd runs/bundled-try
-    for name in clean-a clean-b clean-c clean-d; do
+    for name in clean-a clean-b clean-c clean-d albedo; do
         ln -s "$repository/data/sample" "data/bundled/$name"
     done
 else
@@ -134,4 +149,4 @@ for stage in 12 13; do
     demc-infer export --model "runs/bundled/$stage" -o "runs/bundled/$stage.safetensors"
 done
 "$python" configs/bundled/average.py runs/bundled/12.safetensors runs/bundled/13.safetensors 0.7 runs/bundled/mean.safetensors
-demc-infer export --model runs/bundled/mean.safetensors --precision f16 -o runs/bundled/demc.safetensors
+demc-infer export --model runs/bundled/mean.safetensors --albedo-filter runs/bundled/albedo --precision f16 -o runs/bundled/demc.safetensors
