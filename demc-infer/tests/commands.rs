@@ -355,10 +355,7 @@ fn an_export_can_store_an_albedo_filter() {
     assert!(twice(&|cost| cost["images"][0]["flops_whole"].as_f64()));
 
     // The filter is an input, too.
-    let start = format!(
-        "error: output {} would replace the albedo filter",
-        plain.display()
-    );
+    let start = format!("output {} would replace the albedo filter", plain.display());
     export(&filtered, &plain, &["--albedo-filter", &text(&plain)]).failure(2, &start);
 }
 
