@@ -63,12 +63,9 @@ pub fn network(width: usize) -> Bundle {
         flat_color: [0.5; 3],
     };
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
-    Bundle {
-        model: config
-            .load(&mut Weights::new(weights), &Device::flex())
-            .expect("the network's own weights"),
-        meta: BundleMeta::new(config, normalizer, layout, 0),
-    }
+    let model = config.load(&mut Weights::new(weights), &Device::flex());
+    let model = model.expect("the network's own weights");
+    Bundle::new(BundleMeta::new(config, normalizer, layout, 0), model)
 }
 
 /// The range of a weight's values. That of kernels follows He et al. 2015, `+-sqrt(6 / fan-in)`.

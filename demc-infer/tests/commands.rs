@@ -287,3 +287,82 @@ fn an_export_can_store_another_layout() {
     export(run.path(), &file, &["--layout", "nonsense"])
         .failure(2, "channel layout nonsense: neither");
 }
+
+/// `--albedo-filter` takes a model or its filter; without it, the model keeps its own.
+#[test]
+fn an_export_can_store_an_albedo_filter() {
+    let run = run_directory();
+    let path = |name: &str| run.path().join(name);
+    let [plain, filtered, kept, taken, none] =
+        ["plain", "filtered", "kept", "taken", "none"].map(path);
+    let text = |path: &Path| path.to_str().expect("UTF-8").to_string();
+    let own = text(run.path());
+    export(run.path(), &plain, &[]).success();
+    let outcome = export(run.path(), &filtered, &["--albedo-filter", &own]).success();
+    let count = |path: &Path| {
+        let bytes = std::fs::read(path).expect("the file");
+        safetensors_count(&bytes)
+    };
+    assert!(
+        outcome
+            .stdout
+            .contains(&format!(" {} tensors", 2 * count(&plain))),
+        "{}",
+        outcome.stdout
+    );
+    export(&filtered, &kept, &[]).success();
+    export(&plain, &taken, &["--albedo-filter", &text(&filtered)]).success();
+    export(&filtered, &none, &["--albedo-filter", "none"]).success();
+    let bytes = |path: &Path| std::fs::read(path).expect("the file");
+    assert!(bytes(&kept) == bytes(&filtered) && bytes(&taken) == bytes(&filtered));
+    assert!(bytes(&none) == bytes(&plain));
+
+    let inspect = |path: &Path, flags: &[&str]| {
+        let mut arguments = vec!["inspect".into(), "--model".into(), text(path)];
+        arguments.extend(flags.iter().map(|flag| flag.to_string()));
+        demc_infer(arguments).success().stdout
+    };
+    let shown = inspect(&filtered, &[]);
+    let line = shown.lines().find(|line| line.starts_with("filter"));
+    let line = line.expect("a line for the filter");
+    assert!(
+        line.contains("albedo: demc, released reading, width 2, step 500, "),
+        "{line}"
+    );
+    assert!(!inspect(&plain, &[]).contains("filter"));
+    let json = |path: &Path| -> serde_json::Value {
+        serde_json::from_str(&inspect(path, &["--json", "--tensors"])).expect("JSON")
+    };
+    let (one, two) = (json(&plain), json(&filtered));
+    assert_eq!(two["albedo_filter"]["parameters"], one["parameters"]);
+    assert_eq!(two["albedo_filter"]["step"], 500);
+    assert_eq!(
+        two["tensors"].as_array().map(Vec::len),
+        Some(2 * count(&plain))
+    );
+
+    let cost = |path: &Path| -> serde_json::Value {
+        let arguments = ["cost", "--json", "--size", "64x64", "--model", &text(path)];
+        let outcome = demc_infer(arguments.map(String::from)).success();
+        serde_json::from_str(&outcome.stdout).expect("JSON")
+    };
+    let (one, two) = (cost(&plain), cost(&filtered));
+    let twice = |of: &dyn Fn(&serde_json::Value) -> Option<f64>| {
+        of(&two) == of(&one).map(|value| 2.0 * value)
+    };
+    assert!(twice(&|cost| cost["parameters"].as_f64()));
+    assert!(twice(&|cost| cost["images"][0]["flops"].as_f64()));
+    assert!(twice(&|cost| cost["images"][0]["flops_whole"].as_f64()));
+
+    // The filter is an input, too.
+    let start = format!("output {} would replace the albedo filter", plain.display());
+    export(&filtered, &plain, &["--albedo-filter", &text(&plain)]).failure(2, &start);
+}
+
+/// Number of tensors in a file.
+fn safetensors_count(bytes: &[u8]) -> usize {
+    let length = u64::from_le_bytes(bytes[..8].try_into().expect("8 bytes")) as usize;
+    let header: serde_json::Value =
+        serde_json::from_slice(&bytes[8..8 + length]).expect("a header");
+    header.as_object().expect("keys").len() - 1
+}

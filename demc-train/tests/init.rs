@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
-use common::{config, error_line, train, trained};
+use common::{RESULTS, assert_same_run, config, error_line, kill_after, metrics, train, trained};
 use demc_infer::Bundle;
 use demc_infer::bundle::{Names, Precision};
 use demc_train::run::checkpoint::store::sha256_of;
@@ -112,6 +112,72 @@ fn ranges_of_the_first_run_are_kept() {
     );
     fs::remove_file(&wide).expect("the test's own");
     assert_eq!(ranges_after(&["--resume"]), found);
+}
+
+/// Every file of a run that starts from a model with an albedo filter contains the filter, and a
+/// resumed run has the same bytes.
+#[test]
+fn the_albedo_filter_of_the_first_run_is_kept() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    let path = |name: &str| dir.path().join(name);
+    let (first, filtered) = (path("first"), path("filtered.safetensors"));
+    trained(&config, &first, &["--set=train.steps=2"]);
+    let mut bundle = Bundle::load(&first, &Device::flex()).expect("a network");
+    let mut filter = bundle.clone();
+    filter.meta.step = 77;
+    bundle
+        .set_albedo_filter(filter)
+        .expect("the same positions");
+    let saved = bundle.save(&filtered, Names::Burn, Precision::F32);
+    saved.expect("a file");
+    let filter = bundle.albedo_filter.as_ref().expect("a filter");
+
+    let init = format!("train.init={}", filtered.display());
+    let (whole, broken, plain) = (path("whole"), path("broken"), path("plain"));
+    trained(&config, &whole, &["--set", &init]);
+    for file in RESULTS.iter().filter(|file| file.ends_with(".safetensors")) {
+        if file.ends_with("optimizer.safetensors") {
+            continue;
+        }
+        let found = Bundle::load(&whole.join(file), &Device::flex()).expect(file);
+        let found = found.albedo_filter.expect("a filter");
+        assert_eq!(found.meta, filter.meta, "{file}");
+        assert_eq!(found.model.weights(), filter.model.weights(), "{file}");
+    }
+    // Validation uses it.
+    let init_plain = format!("train.init={}", first.display());
+    trained(&config, &plain, &["--set", &init_plain]);
+    let validated = |run: &Path| metrics(run)[1]["valid_relmse"].clone();
+    assert!(validated(&whole).is_number() && validated(&whole) != validated(&plain));
+
+    // The resumed run needs the initial file no more.
+    assert!(kill_after(&config, &broken, &["--set", &init], 2));
+    fs::remove_file(&filtered).expect("the test's own");
+    trained(&config, &broken, &["--set", &init, "--resume"]);
+    assert_same_run(&whole, &broken, "killed once");
+}
+
+#[test]
+fn a_filter_with_other_positions_is_refused() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let SecondRun {
+        config,
+        init: _,
+        second,
+    } = second_run(dir.path());
+    let mut bundle = Bundle::load(&dir.path().join("first"), &Device::flex()).expect("a network");
+    bundle
+        .set_albedo_filter(bundle.clone())
+        .expect("the same positions");
+    let filtered = dir.path().join("filtered.safetensors");
+    let saved = bundle.save(&filtered, Names::Burn, Precision::F32);
+    saved.expect("a file");
+    let init = format!("train.init={}", filtered.display());
+    let other = ["--set", &init, "--set=data.position=image"];
+    let line = error_line(&train(&config, &second, &other), 1);
+    assert!(line.contains("train the filter with \"image\""), "{line}");
+    assert!(!second.exists());
 }
 
 #[test]

@@ -4,33 +4,10 @@ mod common;
 
 use std::fs;
 use std::path::Path;
-use std::process::Stdio;
-use std::time::{Duration, Instant};
 
 use common::{
-    assert_same_run, command, config, error_line, metrics, place, says, stderr, train, trained,
+    assert_same_run, config, error_line, kill_after, metrics, place, says, stderr, train, trained,
 };
-
-/// Starts the run and kills it (SIGKILL) once its log has `lines` lines. Returns whether it was
-/// still running.
-fn kill_after(config: &Path, run: &Path, args: &[&str], lines: usize) -> bool {
-    let mut child = command(config, run, args)
-        .stdout(Stdio::null())
-        .spawn()
-        .expect("the binary runs");
-    let started = Instant::now();
-    while metrics(run).len() < lines {
-        assert!(started.elapsed() < Duration::from_secs(300), "no progress");
-        if child.try_wait().expect("a child").is_some() {
-            break;
-        }
-        std::thread::sleep(Duration::from_millis(1));
-    }
-    let killed = child.try_wait().expect("a child").is_none();
-    let _ = child.kill();
-    child.wait().expect("a child");
-    killed
-}
 
 #[test]
 fn a_killed_and_resumed_run_equals_an_uninterrupted_one() {

@@ -1,7 +1,9 @@
 """Bundles: safetensors files that `demc-infer export` writes, and denoising with them.
 
 The header's key ``demc`` contains JSON: the model's configuration, the feature statistics of the
-training set, the names of the renderer's channels, and the training step.
+training set, the names of the renderer's channels, and the training step. A bundle may contain a
+second network, which denoises the albedo first: its entry is ``albedo_filter``, and so its tensors'
+prefix.
 """
 
 from __future__ import annotations
@@ -25,6 +27,10 @@ FORMAT = 1
 """The bundle format that this package reads."""
 MAX_ALBEDO = 1.0
 """Larger albedo counts as this."""
+FILTER = "albedo_filter"
+"""Key of the albedo filter's entry in the header."""
+PREFIX = f"{FILTER}."
+"""Prefix of its tensors."""
 TORCH_FROM_BURN = {"gamma": "weight", "beta": "bias"}
 """Last part of a batch-normalisation key: Burn's name to PyTorch's."""
 
@@ -40,6 +46,7 @@ class Bundle:
     step: int
     meta: dict  # the whole header
     demodulate: float = 0.0  # epsilon of albedo demodulation; 0: off
+    albedo_filter: Bundle | None = None  # denoises the albedo (first hit) before the network sees it
 
     def input_scale(self, color_hdr: np.ndarray) -> float:
         """The factor on colour [3, H, W] before the network (`preprocess.input_scale`)."""
@@ -66,11 +73,31 @@ class Bundle:
         """The network between linear radiances, as the ONNX graph has it; differentiable.
 
         Prepared colour [B, 3, H, W] and features [B, 12, H, W] (`preprocess.prepare`) -> [B, 3, H, W].
-        Height and width are multiples of 32.
+        Height and width are multiples of 32. An albedo filter runs first.
         """
+        features = self.with_filtered_albedo(features)
         modulation = self.modulation(features)
         color_gamma = gamma_from_hdr(color, self.gamma) / modulation
         return hdr_from_gamma(self.model(color_gamma, self.features_z_from_raw(features)) * modulation, self.gamma)
+
+    def with_filtered_albedo(self, features: Tensor) -> Tensor:
+        """Prepared features [B, 12, H, W] with the albedo (first hit) that the network sees.
+
+        An image of constant albedo and a bundle without a filter keep theirs.
+        """
+        if self.albedo_filter is None:
+            return features
+        noisy = features[:, 6:9]
+        filtered = self.albedo_filter.radiance(noisy.clamp(0, MAX_ALBEDO), features).clamp(0, MAX_ALBEDO)
+        varies = (noisy.amax((2, 3), True) > noisy.amin((2, 3), True)).any(1, True)
+        return torch.cat((features[:, :6], torch.where(varies, filtered, noisy), features[:, 9:]), 1)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All weights by their PyTorch names, to save them with `meta`; includes the albedo filter."""
+        weights = {name: weight.cpu().contiguous() for name, weight in self.model.state_dict().items()}
+        if self.albedo_filter is not None:
+            weights |= {PREFIX + name: weight for name, weight in self.albedo_filter.tensors().items()}
+        return weights
 
     @torch.inference_mode()
     def denoise(
@@ -90,9 +117,11 @@ class Bundle:
         return out[0, :, :height, :width].cpu().numpy() / scale
 
     def to(self, device: torch.device | str) -> Bundle:
-        """Moves the network and the statistics to `device`, in place."""
+        """Moves the networks and the statistics to `device`, in place."""
         self.model.to(device)
         self.feature_mean, self.feature_std = self.feature_mean.to(device), self.feature_std.to(device)
+        if self.albedo_filter is not None:
+            self.albedo_filter.to(device)
         return self
 
 
@@ -115,11 +144,26 @@ def load(path: str | os.PathLike) -> Bundle:
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}: header entry 'demc': not JSON: {error}") from error
 
+    if not isinstance(meta, dict) or FILTER not in meta:
+        return _network(path, meta, weights)
+    ours = {name: weight for name, weight in weights.items() if not name.startswith(PREFIX)}
+    theirs = {name.removeprefix(PREFIX): weight for name, weight in weights.items() if name not in ours}
+    bundle = _network(path, meta, ours)
+    bundle.albedo_filter = _network(path, meta[FILTER], theirs, FILTER)
+    spaces = [header["normalizer"].get("position", "scene") for header in (meta, meta[FILTER])]
+    if spaces[0] != spaces[1] and meta[FILTER]["model"]["variant"] != "color-only":
+        raise ValueError(f"{path}: the albedo filter takes other positions than the network")
+    return bundle
+
+
+def _network(path: str | os.PathLike, meta: Any, weights: dict[str, Tensor], *parents: str) -> Bundle:
+    """The network that the header `meta` describes. Messages put `parents` before its keys."""
+
     def entry(*keys: str) -> Any:
         value = meta
         for depth, key in enumerate(keys, 1):
             if not isinstance(value, dict) or key not in value:
-                raise ValueError(f"{path}: header entry 'demc': no key {'.'.join(keys[:depth])}")
+                raise ValueError(f"{path}: header entry 'demc': no key {'.'.join((*parents, *keys[:depth]))}")
             value = value[key]
         return value
 
@@ -132,7 +176,7 @@ def load(path: str | os.PathLike) -> Bundle:
     try:
         model.load_state_dict(weights, strict=True)
     except RuntimeError as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
+        raise ValueError(f"{path}: {' '.join((*parents, *str(error).split()))}") from error
     return Bundle(
         model=model.eval(),
         gamma=gamma,

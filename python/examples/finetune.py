@@ -68,8 +68,7 @@ def main() -> None:
                 break
 
     meta = bundle.meta | {"step": bundle.step + step}
-    weights = {name: weight.cpu().contiguous() for name, weight in bundle.model.state_dict().items()}
-    save_file(weights, arguments.output, {"demc": json.dumps(meta)})
+    save_file(bundle.tensors(), arguments.output, {"demc": json.dumps(meta)})
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import demc
+import torch
 from safetensors.torch import save_file
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -37,6 +38,69 @@ class Headers(unittest.TestCase):
     def test_a_whole_header_loads(self) -> None:
         self.write()
         self.assertEqual(demc.load(self.path).step, 7)
+
+    def with_filter(self) -> None:
+        torch.manual_seed(3)
+        config = demc.ModelConfig("semc", width=2)
+        model = demc.Denoiser(config)
+        with torch.no_grad():
+            for weight in model.parameters():
+                weight += torch.empty_like(weight).uniform_(-0.05, 0.06)
+        self.weights |= {f"albedo_filter.{name}": weight for name, weight in model.state_dict().items()}
+        self.meta["albedo_filter"] = self.meta | {"model": asdict(config), "step": 9}
+
+    def test_an_albedo_filter_is_applied_and_comes_back(self) -> None:
+        self.write()
+        plain = demc.load(self.path)
+        self.with_filter()
+        self.write()
+        bundle = demc.load(self.path)
+        self.assertEqual((bundle.step, bundle.albedo_filter.step), (7, 9))
+        self.assertIsNone(bundle.albedo_filter.albedo_filter)
+        self.assertEqual(bundle.tensors().keys(), self.weights.keys())
+
+        images = torch.rand(2, 15, 32, 64, requires_grad=True)
+        color, features = images[:, :3], images[:, 3:]
+        filtered = bundle.with_filtered_albedo(features)
+        kept = [channel for channel in range(12) if not 6 <= channel < 9]
+        self.assertTrue(torch.equal(filtered[:, kept], features[:, kept]))
+        self.assertFalse(torch.equal(filtered[:, 6:9], features[:, 6:9]))
+        expected = plain.radiance(color, filtered)
+        found = bundle.radiance(color, features)
+        self.assertTrue(torch.equal(found, expected))
+        found.sum().backward()
+        self.assertTrue(images.grad.isfinite().all())
+        self.assertIsNotNone(next(bundle.albedo_filter.model.parameters()).grad)
+        # Of two images, one has constant albedo and keeps it.
+        features = features.detach().clone()
+        features[1, 6:9] = 0.25
+        self.assertTrue(torch.equal(bundle.with_filtered_albedo(features)[1], features[1]))
+
+        meta = bundle.meta
+        save_file(bundle.tensors(), self.path, {"demc": json.dumps(meta)})
+        again = demc.load(self.path).albedo_filter.model.state_dict()
+        self.assertTrue(all(torch.equal(weight, again[name]) for name, weight in bundle.albedo_filter.model.state_dict().items()))
+
+    def test_a_wrong_albedo_filter_is_named(self) -> None:
+        self.with_filter()
+        bias = self.weights.pop("albedo_filter.decoder.head.bias")
+        self.write()
+        with self.assertRaisesRegex(ValueError, "albedo_filter .*decoder.head.bias"):
+            demc.load(self.path)
+        self.weights["albedo_filter.decoder.head.bias"] = bias
+        self.meta["albedo_filter"]["normalizer"] = self.meta["normalizer"] | {"position": "image"}
+        self.write()
+        with self.assertRaisesRegex(ValueError, "other positions"):
+            demc.load(self.path)
+        del self.meta["albedo_filter"]["step"]
+        self.write()
+        with self.assertRaisesRegex(ValueError, "no key albedo_filter.step$"):
+            demc.load(self.path)
+        # Without its header entry, the tensors are superfluous.
+        del self.meta["albedo_filter"]
+        self.write()
+        with self.assertRaisesRegex(ValueError, "Unexpected.*albedo_filter"):
+            demc.load(self.path)
 
     def test_a_missing_key_is_named(self) -> None:
         for keys in (

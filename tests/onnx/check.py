@@ -16,6 +16,7 @@ from onnx.tools.update_model_dims import update_inputs_outputs_dims
 OPERATORS = {"Relu", "Pow", "Sub", "Div", "Conv", "ConvTranspose", "MaxPool", "Min", "Concat", "Cast", "Mul", "Slice", "Add"}
 KERNEL_HEAD = {"AveragePool", "Greater", "Max", "Pad", "ReduceSum", "Reshape", "Resize", "Shape", "Sigmoid", "Softmax"}
 """Operators of a kernel head."""
+FILTER = {"Clip", "ReduceMax", "ReduceMin", "Greater", "Where"}
 SHAPES = {"color": ["batch", 3, "height", "width"], "features": ["batch", 12, "height", "width"]}
 OUTPUT = ["batch", 3, "height", "width"]
 
@@ -29,15 +30,18 @@ def check_structure(path: Path) -> None:
     model = onnx.load(path)
     assert [(o.domain, o.version) for o in model.opset_import] == [("", 17)]
     operators = {node.op_type for node in model.graph.node}
-    assert operators <= OPERATORS | KERNEL_HEAD
+    has_filter = path.stem.endswith("-filter")
+    assert operators <= OPERATORS | KERNEL_HEAD | (FILTER if has_filter else set())
     assert {value.name: shape(value) for value in model.graph.input} == SHAPES
     assert {value.name: shape(value) for value in model.graph.output} == {"output": OUTPUT}
     meta = {entry.key: entry.value for entry in model.metadata_props}
     bundle = json.loads(meta["demc"])
-    assert (operators <= OPERATORS) == (bundle["model"]["head"] != "kernel")
+    networks = [bundle, bundle.get("albedo_filter", bundle)]
+    assert ("Softmax" in operators) == any(network["model"]["head"] == "kernel" for network in networks)
     assert path.stem.startswith(f"{bundle['model']['variant']}-{bundle['model']['reading']}-"), path
     assert bundle["normalizer"]["gamma"] == 2.2 and len(bundle["normalizer"]["features"]["std"]) == 12
     assert len(json.loads(meta["demc.features"])) == 12
+    assert ("albedo_filter" in bundle) == has_filter
     assert bundle["layout"]["color"] == ["R", "G", "B"] and bundle["step"] == model.model_version
 
     # With fixed input sizes, shape inference must determine every shape, including the output.

@@ -78,6 +78,19 @@ fn onnx_runtime_computes_what_this_program_does() {
             }
         }
     }
+    // Networks of earlier cases as albedo filters of each other.
+    let count = bundles.len();
+    for (i, filter) in [(0, count - 2), (1, count - 1), (count - 4, 0)] {
+        let (name, mut bundle) = bundles[i].clone();
+        let filter = bundles[filter].1.clone();
+        bundle
+            .set_albedo_filter(filter)
+            .expect("the same positions");
+        let name = format!("{name}-filter");
+        let path = folder.join(&name).with_extension("onnx");
+        bundle.export_onnx(&path, Precision::F32).expect("exported");
+        bundles.push((name, bundle));
+    }
     let frames: Vec<Vec<Frame>> = SIZES
         .iter()
         .map(|size| frames(*size, &bundles[0].1, &mut rng))
@@ -142,7 +155,7 @@ fn scaled(bundle: &Bundle, rng: &mut ChaCha8Rng) -> Bundle {
         let model = config.load(&mut Weights::new(weights), &Device::flex());
         Bundle {
             model: model.expect("its own weights"),
-            meta: bundle.meta.clone(),
+            ..bundle.clone()
         }
     };
     let image = with_head(&f32::abs).denoise(frame).expect("denoised");

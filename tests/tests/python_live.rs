@@ -84,7 +84,20 @@ fn verify_accepts_pytorch_with_either_style_of_names() {
     let path = folder.path().join("x.safetensors");
     let mut rng = ChaCha8Rng::seed_from_u64(5);
     let mut bundle = random_bundle(Variant::Demc, Reading::Released, MOVE_BY, &mut rng);
+    let filter = random_bundle(Variant::Semc, Reading::Released, MOVE_BY, &mut rng);
+    let mut filtered = bundle.clone();
+    filtered
+        .set_albedo_filter(filter)
+        .expect("the same positions");
     for names in [Names::Torch, Names::Burn] {
+        filtered
+            .export(&path, names, Precision::F32)
+            .expect("exported");
+        let found = verify(&path, Runtime::PyTorch, python.path(), &filtered).expect("run");
+        assert!(found.deviations.iter().all(|d| d.passes()), "{found:?}");
+        // Without its filter, the same network gives another image.
+        let other = verify(&path, Runtime::PyTorch, python.path(), &bundle).expect("run");
+        assert!(!other.deviations.iter().any(|d| d.passes()), "{other:?}");
         if names == Names::Burn {
             // Auto-exposure, demodulation and positions relative to the image.
             let statistics = bundled_model().meta;
@@ -143,7 +156,8 @@ fn weights_trained_in_pytorch_are_imported() {
 
         let error = BundleFile::import(&weights, None).expect_err("save_file drops the header");
         assert!(matches!(error, BundleError::Foreign { .. }), "{error}");
-        let imported = BundleFile::import(&weights, Some(bundle.meta.clone())).expect("imported");
+        let like = BundleFile::read(&exported).expect("an export");
+        let imported = BundleFile::import(&weights, Some(like)).expect("imported");
         let tuned = imported.into_bundle(&Device::flex()).expect("fits");
         assert_ne!(tuned.model.weights(), bundle.model.weights());
         let found = tuned.denoise(&frame).expect("denoised");
@@ -175,6 +189,35 @@ fn example(python: &Python, script: &str, model: &Path, bundle: &Bundle) {
         .flat_map(Plane::to_f32)
         .collect();
     assert_close(&script.display().to_string(), &found, &expected, TOLERANCE);
+}
+
+/// The bundled model with itself as albedo filter.
+fn filtered_model() -> Bundle {
+    let mut bundle = bundled_model();
+    let filter = bundled_model();
+    bundle
+        .set_albedo_filter(filter)
+        .expect("the same positions");
+    bundle
+}
+
+#[test]
+fn the_examples_apply_an_albedo_filter() {
+    let folder = TempDir::new().expect("a temporary directory");
+    let bundle = filtered_model();
+    if let Some(python) = onnx() {
+        let model = folder.path().join("demc.onnx");
+        bundle
+            .export_onnx(&model, Precision::F32)
+            .expect("exported");
+        example(&python, "onnx_denoise.py", &model, &bundle);
+    }
+    if let Some(python) = torch() {
+        let model = folder.path().join("demc.safetensors");
+        let exported = bundle.export(&model, Names::Torch, Precision::F32);
+        exported.expect("exported");
+        example(&python, "torch_denoise.py", &model, &bundle);
+    }
 }
 
 #[test]

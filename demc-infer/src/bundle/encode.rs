@@ -9,7 +9,7 @@ use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
 
 use super::tensors::{EncodedTensor, f32_bytes, serialize};
-use super::{BundleError, BundleMeta};
+use super::{Bundle, BundleError, BundleMeta, PREFIX};
 
 /// The metadata key in the header that identifies a bundle.
 pub(super) const KEY: &str = "demc";
@@ -83,11 +83,29 @@ impl Precision {
     }
 }
 
-/// The header entry: the metadata and the naming scheme.
+/// Everything about a bundle's networks except their weights, as JSON.
+#[derive(Serialize)]
+pub(crate) struct Description<'a> {
+    #[serde(flatten)]
+    meta: &'a BundleMeta,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    albedo_filter: Option<&'a BundleMeta>,
+}
+
+impl<'a> Description<'a> {
+    pub(crate) fn of(bundle: &'a Bundle) -> Self {
+        Self {
+            meta: &bundle.meta,
+            albedo_filter: bundle.albedo_filter.as_ref().map(|filter| &filter.meta),
+        }
+    }
+}
+
+/// The header entry: the description and the naming scheme.
 #[derive(Serialize)]
 struct Header<'a> {
     #[serde(flatten)]
-    meta: &'a BundleMeta,
+    description: Description<'a>,
     names: Names,
 }
 
@@ -97,26 +115,30 @@ struct Header<'a> {
 /// # Errors
 /// A weight beyond f16's range.
 pub(super) fn encode(
-    meta: &BundleMeta,
-    weights: Vec<Weight>,
+    bundle: &Bundle,
     names: Names,
     precision: Precision,
 ) -> Result<Vec<u8>, BundleError> {
-    let header = serde_json::to_string(&Header { meta, names });
+    let description = Description::of(bundle);
+    let header = serde_json::to_string(&Header { description, names });
     let header = header.map_err(|error| BundleError::Encode(error.to_string()))?;
-    let mut tensors = Vec::with_capacity(weights.len());
-    for (weight, spec) in weights.into_iter().zip(meta.model.weight_specs()) {
-        debug_assert_eq!(weight.name, spec.name);
-        let dtype = precision.dtype(spec.role);
-        tensors.push(EncodedTensor {
-            name: names.in_file(&spec),
-            dtype,
-            bytes: match dtype {
-                Dtype::F16 => f16_bytes(&weight)?,
-                _ => f32_bytes(&weight.data),
-            },
-            shape: weight.shape,
-        });
+    let mut tensors = Vec::new();
+    for (network, prefix) in bundle.networks().zip(["", PREFIX]) {
+        let specs = network.meta.model.weight_specs();
+        for (mut weight, spec) in network.model.weights().into_iter().zip(specs) {
+            debug_assert_eq!(weight.name, spec.name);
+            weight.name.insert_str(0, prefix);
+            let dtype = precision.dtype(spec.role);
+            tensors.push(EncodedTensor {
+                name: format!("{prefix}{}", names.in_file(&spec)),
+                dtype,
+                bytes: match dtype {
+                    Dtype::F16 => f16_bytes(&weight)?,
+                    _ => f32_bytes(&weight.data),
+                },
+                shape: weight.shape,
+            });
+        }
     }
     let metadata = HashMap::from([(KEY.to_string(), header)]);
     serialize(&tensors, Some(metadata)).map_err(BundleError::Encode)

@@ -54,6 +54,9 @@ pub enum BundleError {
     /// Imported tensors do not match the network.
     #[error("{}: {problems}", path.display())]
     Import { path: PathBuf, problems: String },
+    /// A network that cannot be the albedo filter of another.
+    #[error("{0}")]
+    AlbedoFilter(String),
     /// A weight beyond f16's range.
     #[error("tensor {name}: {value} does not fit into f16; export with f32")]
     Overflow { name: String, value: f32 },

@@ -12,8 +12,9 @@ use safetensors::tensor::{Dtype, Metadata};
 use serde::Deserialize;
 
 use super::encode::KEY;
+use super::filter::FILTER_KEY;
 use super::tensors::{one_line, values};
-use super::{BundleError, BundleMeta, FORMAT, Names, Precision, locate};
+use super::{BundleError, BundleMeta, FORMAT, Names, PREFIX, Precision, locate};
 
 /// Longest accepted header in bytes (ours: the widest network's has 20 kB).
 const MAX_HEADER: u64 = 4 << 20;
@@ -31,8 +32,10 @@ pub struct BundleFile {
     pub names: Names,
     /// `F16` if any tensor has that type.
     pub precision: Precision,
-    /// The tensors with Burn's names, as f32, sorted by name.
+    /// The tensors with Burn's names, as f32, sorted by name; without those of the albedo filter.
     pub weights: Vec<Weight>,
+    /// The albedo filter of the file; it has none of its own. Its tensors have no prefix here.
+    pub albedo_filter: Option<Box<BundleFile>>,
 }
 
 impl BundleFile {
@@ -53,11 +56,15 @@ impl BundleFile {
     /// # Errors
     /// As [`read`](Self::read), except for reading.
     pub fn parse(path: PathBuf, bytes: &[u8]) -> Result<Self, BundleError> {
-        let (meta, names) = parse_meta(&path, bytes)?;
+        let header = parse_meta(&path, bytes)?;
+        let names = header.names;
         let tensors = SafeTensors::deserialize(bytes).map_err(|error| damaged(&path, &error))?;
         let mut precision = Precision::F32;
         let mut weights = Vec::with_capacity(tensors.len());
-        let mut specs = names.specs_in_file(&meta.model);
+        let mut filter_weights = Vec::new();
+        let mut specs = names.specs_in_file(&header.meta.model);
+        let filter = header.albedo_filter.as_ref();
+        let mut filter_specs = filter.map(|filter| names.specs_in_file(&filter.model));
         for (name, view) in tensors.iter() {
             if view.dtype() == Dtype::F16 {
                 precision = Precision::F16;
@@ -67,6 +74,10 @@ impl BundleFile {
                 name: one_line(name),
                 detail,
             })?;
+            let (weights, specs, name) = match (name.strip_prefix(PREFIX), &mut filter_specs) {
+                (Some(name), Some(specs)) => (&mut filter_weights, specs, name),
+                _ => (&mut weights, &mut specs, name),
+            };
             weights.push(Weight {
                 name: match specs.remove(name) {
                     Some(spec) => spec.name,
@@ -76,14 +87,20 @@ impl BundleFile {
                 data,
             });
         }
-        weights.sort_by(|a, b| a.name.cmp(&b.name));
-        Ok(Self {
-            path,
+        for weights in [&mut weights, &mut filter_weights] {
+            weights.sort_by(|a, b| a.name.cmp(&b.name));
+        }
+        let file = |meta, weights, albedo_filter| Self {
+            path: path.clone(),
             meta,
             names,
             precision,
             weights,
-        })
+            albedo_filter,
+        };
+        let filter = header.albedo_filter;
+        let filter = filter.map(|meta| Box::new(file(meta, filter_weights, None)));
+        Ok(file(header.meta, weights, filter))
     }
 }
 
@@ -134,32 +151,75 @@ pub(super) fn damaged(path: &Path, error: &safetensors::SafeTensorError) -> Bund
     }
 }
 
+/// The parsed header entry of a bundle file.
+pub(super) struct Header {
+    pub meta: BundleMeta,
+    pub names: Names,
+    /// Metadata of the albedo filter.
+    pub albedo_filter: Option<BundleMeta>,
+}
+
 /// The metadata of a bundle file.
 ///
 /// # Errors
 /// The bytes are no safetensors file, or no bundle.
-pub(super) fn parse_meta(path: &Path, bytes: &[u8]) -> Result<(BundleMeta, Names), BundleError> {
+pub(super) fn parse_meta(path: &Path, bytes: &[u8]) -> Result<Header, BundleError> {
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|error| damaged(path, &error))?;
     let entry = header.metadata().as_ref().and_then(|all| all.get(KEY));
     let entry = entry.ok_or_else(|| BundleError::Foreign { path: path.into() })?;
     parse_header(entry, path)
 }
 
-/// Parses the header entry. The format is checked first, because another format may have other
-/// keys.
-fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleError> {
+/// Parses the header entry, with the entry of an albedo filter in it.
+fn parse_header(entry: &str, path: &Path) -> Result<Header, BundleError> {
     #[derive(Deserialize)]
-    struct Version {
-        format: u64,
-    }
-    #[derive(Deserialize)]
-    struct Style {
+    struct Rest {
         names: Names,
+        albedo_filter: Option<serde_json::Value>,
     }
     let invalid = |detail: String| BundleError::Header {
         path: path.into(),
         detail: one_line(&detail),
     };
+    let meta = parse_network(entry, path, &invalid)?;
+    let rest = serde_json::from_str(entry).map_err(|error| invalid(error.to_string()))?;
+    let Rest {
+        names,
+        albedo_filter,
+    } = rest;
+    let Some(entry) = albedo_filter else {
+        return Ok(Header {
+            meta,
+            names,
+            albedo_filter: None,
+        });
+    };
+    let within = |detail: String| invalid(format!("{FILTER_KEY}: {detail}"));
+    if entry.get(FILTER_KEY).is_some() {
+        return Err(within("has a filter of its own".into()));
+    }
+    let filter = parse_network(&entry.to_string(), path, &within)?;
+    match filter.filter_problem(meta.normalizer.position) {
+        Some(problem) => Err(within(problem)),
+        None => Ok(Header {
+            meta,
+            names,
+            albedo_filter: Some(filter),
+        }),
+    }
+}
+
+/// Parses the metadata of one network. The format is checked first, because another format may have
+/// other keys.
+fn parse_network(
+    entry: &str,
+    path: &Path,
+    invalid: &dyn Fn(String) -> BundleError,
+) -> Result<BundleMeta, BundleError> {
+    #[derive(Deserialize)]
+    struct Version {
+        format: u64,
+    }
     let json = |error: serde_json::Error| invalid(error.to_string());
     let Version { format } = serde_json::from_str(entry).map_err(json)?;
     if format != u64::from(FORMAT) {
@@ -168,14 +228,13 @@ fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleE
             found: format,
         });
     }
-    let Style { names } = serde_json::from_str(entry).map_err(json)?;
     let meta: BundleMeta = serde_json::from_str(entry).map_err(json)?;
     let mut problems = meta.model.validate();
     problems.extend(statistics_problems(&meta));
     let layout = meta.layout.validate().into_iter();
     problems.extend(layout.map(|problem| format!("layout: {problem}")));
     match problems.is_empty() {
-        true => Ok((meta, names)),
+        true => Ok(meta),
         false => Err(invalid(problems.join("; "))),
     }
 }

@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use demc_model::{Role, Weight, WeightSpec};
+use demc_model::{ModelConfig, Role, Weight, WeightSpec};
 use safetensors::SafeTensors;
-use safetensors::tensor::Dtype;
+use safetensors::tensor::{Dtype, TensorView};
 
 use super::file::{damaged, parse_meta, read};
 use super::tensors::{one_line, values};
-use super::{BundleError, BundleFile, BundleMeta, Names, Precision};
+use super::{BundleError, BundleFile, Names, PREFIX, Precision};
 
 /// Invalid tensors by kind of problem.
 #[derive(Default)]
@@ -40,34 +40,23 @@ impl TensorProblems {
     }
 }
 
-impl BundleFile {
-    /// Reads the weights of a network from the safetensors file `path`, with PyTorch's or Burn's
-    /// names.
-    ///
-    /// `like` describes the network. Without it, the file's own header must.
-    ///
-    /// # Errors
-    /// - The file cannot be read or is no safetensors file.
-    /// - [`BundleError::Foreign`]: neither `like` nor the header describes the network.
-    /// - [`BundleError::Import`]: lists every tensor that is missing, unknown, misshaped, of a type
-    ///   other than f32 and f16, or not finite.
-    pub fn import(path: &Path, like: Option<BundleMeta>) -> Result<Self, BundleError> {
-        let bytes = read(path)?;
-        let meta = match like {
-            Some(meta) => meta,
-            None => parse_meta(path, &bytes)?.0,
-        };
-        let file = SafeTensors::deserialize(&bytes).map_err(|error| damaged(path, &error))?;
-        let mut found: BTreeMap<String, _> = file
-            .iter()
-            .map(|(name, view)| (one_line(name), view))
-            .collect();
-        let mut problems = TensorProblems::default();
-        let mut precision = Precision::F32;
-        let mut weights = Vec::with_capacity(found.len());
-        for spec in meta.model.weight_specs() {
-            let called = Names::Torch.in_file(&spec);
-            let view = found.remove(&called).or_else(|| found.remove(&spec.name));
+/// The tensors of a file that no network has taken yet, and what is wrong with those taken.
+struct Tensors<'a> {
+    found: BTreeMap<String, TensorView<'a>>,
+    problems: TensorProblems,
+    precision: Precision,
+}
+
+impl Tensors<'_> {
+    /// Takes the tensors of `model`, whose names have `prefix`.
+    fn take(&mut self, prefix: &str, model: &ModelConfig) -> Vec<Weight> {
+        let problems = &mut self.problems;
+        let mut weights = Vec::new();
+        for spec in model.weight_specs() {
+            let called = format!("{prefix}{}", Names::Torch.in_file(&spec));
+            let found = &mut self.found;
+            let view = found.remove(&called);
+            let view = view.or_else(|| found.remove(&format!("{prefix}{}", spec.name)));
             let WeightSpec {
                 name, shape, role, ..
             } = spec;
@@ -82,7 +71,7 @@ impl BundleFile {
                 continue;
             }
             if view.dtype() == Dtype::F16 {
-                precision = Precision::F16;
+                self.precision = Precision::F16;
             }
             match values(&view) {
                 Err(detail) => problems.unusable.push(format!("{called} ({detail})")),
@@ -92,19 +81,72 @@ impl BundleFile {
                 Ok(data) => weights.push(Weight { name, shape, data }),
             }
         }
+        weights
+    }
+}
+
+impl BundleFile {
+    /// Reads the weights of a network from the safetensors file `path`, with PyTorch's or Burn's
+    /// names.
+    ///
+    /// `like` describes the network. Without it, the file's own header must. A file without the
+    /// tensors of an albedo filter gets the filter of `like`.
+    ///
+    /// # Errors
+    /// - The file cannot be read or is no safetensors file.
+    /// - [`BundleError::Foreign`]: neither `like` nor the header describes the network.
+    /// - [`BundleError::Import`]: lists every tensor that is missing, unknown, misshaped, of a type
+    ///   other than f32 and f16, or not finite.
+    pub fn import(path: &Path, like: Option<BundleFile>) -> Result<Self, BundleError> {
+        let bytes = read(path)?;
+        let (meta, filter_meta, mut filter) = match like {
+            Some(like) => {
+                let filter = like.albedo_filter;
+                let meta = filter.as_ref().map(|filter| filter.meta.clone());
+                (like.meta, meta, filter)
+            }
+            None => {
+                let header = parse_meta(path, &bytes)?;
+                (header.meta, header.albedo_filter, None)
+            }
+        };
+        let file = SafeTensors::deserialize(&bytes).map_err(|error| damaged(path, &error))?;
+        let mut tensors = Tensors {
+            found: file
+                .iter()
+                .map(|(name, view)| (one_line(name), view))
+                .collect(),
+            problems: TensorProblems::default(),
+            precision: Precision::F32,
+        };
+        let has_filter = tensors.found.keys().any(|name| name.starts_with(PREFIX));
+        let weights = tensors.take("", &meta.model);
+        let imported = |meta, weights, albedo_filter, precision| Self {
+            path: path.into(),
+            meta,
+            names: Names::Torch,
+            precision,
+            weights,
+            albedo_filter,
+        };
+        if let Some(meta) = filter_meta
+            && (has_filter || filter.is_none())
+        {
+            let weights = tensors.take(PREFIX, &meta.model);
+            filter = Some(Box::new(imported(meta, weights, None, tensors.precision)));
+        }
+        let Tensors {
+            found,
+            mut problems,
+            precision,
+        } = tensors;
         problems.unknown.extend(found.into_keys());
         match problems.line() {
             Some(problems) => Err(BundleError::Import {
                 path: path.into(),
                 problems,
             }),
-            None => Ok(Self {
-                path: path.into(),
-                meta,
-                names: Names::Torch,
-                precision,
-                weights,
-            }),
+            None => Ok(imported(meta, weights, filter, precision)),
         }
     }
 }
@@ -116,7 +158,6 @@ mod tests {
     use super::*;
     use burn::tensor::Device;
     use demc_model::Variant;
-    use safetensors::tensor::TensorView;
 
     /// A file with PyTorch's names and no header, as `safetensors.torch.save_file` writes it.
     fn saved(bundle: &Bundle, change: impl FnOnce(&mut Vec<Weight>)) -> tempfile::TempPath {
@@ -132,8 +173,14 @@ mod tests {
         path
     }
 
+    /// The bundle as a file that was read.
+    fn like(bundle: &Bundle) -> Option<BundleFile> {
+        let bytes = bundle.to_bytes(Names::Burn, Precision::F32).expect("bytes");
+        Some(BundleFile::parse("like".into(), &bytes).expect("a bundle"))
+    }
+
     fn error(path: &Path, bundle: &Bundle) -> String {
-        let error = BundleFile::import(path, Some(bundle.meta.clone())).expect_err("refused");
+        let error = BundleFile::import(path, like(bundle)).expect_err("refused");
         let text = error.to_string();
         let start = format!("{}: ", path.display());
         text.strip_prefix(&start).expect("path first").to_string()
@@ -149,10 +196,7 @@ mod tests {
                 file.into_bundle(&Device::flex()).expect("fits")
             };
             let plain = saved(&bundle, |_| ());
-            assert_eq!(
-                bytes(&back(&plain, Some(bundle.meta.clone()))),
-                bytes(&bundle)
-            );
+            assert_eq!(bytes(&back(&plain, like(&bundle))), bytes(&bundle));
             let error = BundleFile::import(&plain, None).expect_err("no header");
             assert!(matches!(error, BundleError::Foreign { .. }), "{error}");
 
@@ -175,11 +219,11 @@ mod tests {
         theirs
             .save(&path, Names::Torch, Precision::F16)
             .expect("saved");
-        let mut like = theirs.meta.clone();
-        like.step = 999;
-        like.normalizer.features.mean[0] = 7.0;
-        let file = BundleFile::import(&path, Some(like.clone())).expect("imported");
-        assert_eq!((file.meta, file.precision), (like, Precision::F16));
+        let mut other = theirs.clone();
+        other.meta.step = 999;
+        other.meta.normalizer.features.mean[0] = 7.0;
+        let file = BundleFile::import(&path, like(&other)).expect("imported");
+        assert_eq!((file.meta, file.precision), (other.meta, Precision::F16));
     }
 
     #[test]

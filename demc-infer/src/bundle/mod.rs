@@ -9,10 +9,14 @@
 //! Statistics are stored with the weights because every output value depends on them. Weights
 //! without them do not load, and no flag replaces them. The layout is that of the training data;
 //! another file may have another one.
+//!
+//! A bundle may contain a second network, the albedo filter. Its tensors have the prefix
+//! `albedo_filter.`, and the header entry has its [`BundleMeta`] as `albedo_filter`.
 
 mod encode;
 mod error;
 mod file;
+mod filter;
 mod import;
 pub mod locate;
 pub mod tensors;
@@ -23,12 +27,14 @@ use std::path::Path;
 use burn::tensor::Device;
 use demc_data::layout::{Missing, MissingPolicies};
 use demc_data::{ChannelLayout, Normalizer, Ranges};
-use demc_model::{Denoiser, ModelConfig, Weights};
+use demc_model::{Denoiser, ModelConfig, Weights, WeightsError};
 use serde::{Deserialize, Serialize};
 
+pub(crate) use encode::Description;
 pub use encode::{Names, Precision};
 pub use error::BundleError;
 pub use file::BundleFile;
+pub(crate) use filter::PREFIX;
 
 /// The bundle format that this build writes and reads. It increases when a tensor's name or meaning
 /// changes.
@@ -90,9 +96,21 @@ pub struct Bundle {
     pub meta: BundleMeta,
     /// The network.
     pub model: Denoiser,
+    /// A second network, which denoises the first hit's albedo before this one sees it. It has no
+    /// filter of its own.
+    pub albedo_filter: Option<Box<Bundle>>,
 }
 
 impl Bundle {
+    /// A network without an albedo filter.
+    pub fn new(meta: BundleMeta, model: Denoiser) -> Self {
+        Self {
+            meta,
+            model,
+            albedo_filter: None,
+        }
+    }
+
     /// The feature buffers that a file may lack, and what replaces them. The policies are those of
     /// the training's layout. Without one, texture1 replaces texture2 and zeros the position.
     /// With the bundled model these two changed the error by less than 3 %.
@@ -119,7 +137,7 @@ impl Bundle {
     /// # Errors
     /// A weight beyond f16's range.
     pub fn to_bytes(&self, names: Names, precision: Precision) -> Result<Vec<u8>, BundleError> {
-        encode::encode(&self.meta, self.model.weights(), names, precision)
+        encode::encode(self, names, precision)
     }
 
     /// Writes as [`save`](Self::save), reads the file back and compares: metadata and f32 tensors
@@ -138,22 +156,40 @@ impl Bundle {
             path: path.into(),
             what,
         };
-        let mut back = BundleFile::read(path)?;
-        if back.meta != self.meta || back.names != names {
+        let back = BundleFile::read(path)?;
+        if back.names != names {
             return Err(differs("the header".into()));
+        }
+        match self.difference(&back, precision) {
+            None => Ok(()),
+            Some(what) => Err(differs(what)),
+        }
+    }
+
+    /// The first difference to `back`, which was written with this precision.
+    fn difference(&self, back: &BundleFile, precision: Precision) -> Option<String> {
+        if back.meta != self.meta {
+            return Some("the header".into());
         }
         let roles = self.meta.model.weight_specs().into_iter();
         let roles = roles.map(|spec| spec.role);
         let mut written: Vec<_> = self.model.weights().into_iter().zip(roles).collect();
         written.sort_by(|(a, _), (b, _)| a.name.cmp(&b.name));
-        back.weights.sort_by(|a, b| a.name.cmp(&b.name));
         if written.len() != back.weights.len() {
-            return Err(differs("the number of tensors".into()));
+            return Some("the number of tensors".into());
         }
         let mut pairs = written.iter().zip(&back.weights);
-        match pairs.find(|((weight, role), read)| !precision.preserves(*role, weight, read)) {
-            None => Ok(()),
-            Some(((weight, _), _)) => Err(differs(format!("tensor {}", weight.name))),
+        let other = pairs.find(|((weight, role), read)| !precision.preserves(*role, weight, read));
+        if let Some(((weight, _), _)) = other {
+            return Some(format!("tensor {}", weight.name));
+        }
+        match (&self.albedo_filter, &back.albedo_filter) {
+            (None, None) => None,
+            (Some(filter), Some(back)) => {
+                let what = filter.difference(back, precision);
+                what.map(|what| format!("in the albedo filter, {what}"))
+            }
+            _ => Some("the albedo filter".into()),
         }
     }
 
@@ -184,25 +220,46 @@ impl Bundle {
 }
 
 impl BundleFile {
-    /// The network that the file describes, with its weights, on `device`.
+    /// The network that the file describes, with its weights, on `device`. Its albedo filter is on
+    /// the device without autodiff, because it is never trained there.
     ///
     /// # Errors
     /// A missing, superfluous or misshaped tensor, by name.
     pub fn into_bundle(self, device: &Device) -> Result<Bundle, BundleError> {
+        self.build("", device)
+    }
+
+    /// Builds the network. Errors name tensors with `prefix`.
+    fn build(self, prefix: &str, device: &Device) -> Result<Bundle, BundleError> {
         let Self {
             path,
             meta,
             weights,
+            albedo_filter,
             ..
         } = self;
-        let model = meta
-            .model
-            .load(&mut Weights::new(weights), device)
-            .map_err(|source| BundleError::Weights { path, source })?;
-        Ok(Bundle { meta, model })
+        let model = meta.model.load(&mut Weights::new(weights), device);
+        let model = model.map_err(|mut source| {
+            match &mut source {
+                WeightsError::Missing { name }
+                | WeightsError::Shape { name, .. }
+                | WeightsError::Unknown { name, .. } => name.insert_str(0, prefix),
+                #[allow(unreachable_patterns, reason = "the enum may grow")]
+                _ => {}
+            }
+            BundleError::Weights { path, source }
+        })?;
+        let mut bundle = Bundle::new(meta, model);
+        if let Some(file) = albedo_filter {
+            let filter = file.build(PREFIX, &device.clone().without_autodiff())?;
+            bundle.albedo_filter = Some(Box::new(filter));
+        }
+        Ok(bundle)
     }
 }
 
+#[cfg(test)]
+mod filter_tests;
 #[cfg(test)]
 mod hostile;
 #[cfg(test)]

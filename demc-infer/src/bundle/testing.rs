@@ -2,7 +2,8 @@
 
 use burn::tensor::Device;
 use demc_data::{ChannelLayout, FEATURES, FeatureStats, Frame, Normalizer, PositionSpace};
-use demc_model::{ModelConfig, Reading, Variant};
+use demc_model::{ModelConfig, Reading, Variant, Weights};
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
@@ -30,10 +31,29 @@ pub(crate) fn bundle(variant: Variant) -> Bundle {
     };
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
     let mut rng = ChaCha8Rng::seed_from_u64(7);
-    Bundle {
-        model: model.init(&mut rng, normalizer.flat_color, &Device::flex()),
-        meta: BundleMeta::new(model, normalizer, layout, 12),
+    let network = model.init(&mut rng, normalizer.flat_color, &Device::flex());
+    Bundle::new(BundleMeta::new(model, normalizer, layout, 12), network)
+}
+
+/// The network of [`bundle`] with an albedo filter of the variant `filter`, whose output convolution is
+/// random, so that the albedo changes.
+pub(crate) fn filtered(variant: Variant, filter: Variant) -> Bundle {
+    let mut network = bundle(variant);
+    let mut model = bundle(filter);
+    model.meta.step = 77;
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    let mut weights = model.model.weights();
+    for weight in &mut weights {
+        let random = |value: &mut f32| *value += rng.random_range(-0.05..0.06);
+        weight.data.iter_mut().for_each(random);
     }
+    let mut weights = Weights::new(weights);
+    let loaded = model.meta.model.load(&mut weights, &Device::flex());
+    model.model = loaded.expect("its own weights");
+    network
+        .set_albedo_filter(model)
+        .expect("the same positions");
+    network
 }
 
 pub(crate) fn frame(width: usize, height: usize) -> Frame {

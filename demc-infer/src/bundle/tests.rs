@@ -17,7 +17,7 @@ const STYLES: [(Names, Precision); 4] = [
 ];
 
 fn encoded(bundle: &Bundle, names: Names, precision: Precision) -> Vec<u8> {
-    encode::encode(&bundle.meta, bundle.model.weights(), names, precision).expect("bytes")
+    encode::encode(bundle, names, precision).expect("bytes")
 }
 
 type TensorList = Vec<(String, Dtype, Vec<usize>, Vec<u8>)>;

@@ -57,6 +57,7 @@ fn size(text: &str) -> Result<(usize, usize), String> {
 struct CostReport {
     #[serde(flatten)]
     network: ModelConfig,
+    /// With those of the albedo filter.
     parameters: u64,
     /// Size of the weights in memory.
     weight_bytes: u64,
@@ -69,8 +70,8 @@ struct CostReport {
 struct ImageCost {
     width: usize,
     height: usize,
-    /// Floating-point operations with halos and padding. Multiplication and addition count as one
-    /// each.
+    /// Floating-point operations with halos and padding, and with the albedo filter. Multiplication
+    /// and addition count as one each.
     flops: f64,
     /// Operations without halos.
     flops_whole: f64,
@@ -97,7 +98,9 @@ impl Arguments {
             sizes.push((window.width, window.height));
         }
         let config = bundle.model.config();
-        let parameters = config.parameter_count();
+        let networks = bundle.networks();
+        let parameters = networks.map(|network| network.meta.model.parameter_count());
+        let parameters = parameters.sum();
         let images = sizes
             .into_iter()
             .map(|(width, height)| image(&bundle, &tiling, width, height));
@@ -122,14 +125,20 @@ fn image(
     height: usize,
 ) -> Result<ImageCost, memory::TooLarge> {
     let tiles = bundle.tiles(height, width, tiling, Ensemble::One)?;
-    let config = bundle.model.config();
     let (tall, wide) = tiles.largest();
     let padded = height.next_multiple_of(DOWNSAMPLING) * width.next_multiple_of(DOWNSAMPLING);
+    let (mut flops, mut flops_whole) = (0.0, 0.0);
+    for network in bundle.networks() {
+        let per_pixel = network.meta.model.flops_per_pixel();
+        let tiles = network.tiles(height, width, tiling, Ensemble::One)?;
+        flops += per_pixel * tiles.computed_pixels() as f64;
+        flops_whole += per_pixel * padded as f64;
+    }
     Ok(ImageCost {
         width,
         height,
-        flops: config.flops_per_pixel() * tiles.computed_pixels() as f64,
-        flops_whole: config.flops_per_pixel() * padded as f64,
+        flops,
+        flops_whole,
         pass_bytes: bundle.pass_bytes(tall, wide),
         image_bytes: (width * height * (3 + 12 + 3) * size_of::<f32>()) as u64,
         tiles: tiles.count(),

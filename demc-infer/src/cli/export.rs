@@ -7,13 +7,15 @@ use burn::tensor::Device;
 use clap::{Args, ValueEnum};
 use demc_data::ChannelLayout;
 use demc_infer::verify::{Runtime, TOLERANCE, verify};
-use demc_infer::{Bundle, Names, Precision};
+use demc_infer::{Bundle, BundleFile, Names, Precision};
 
 use super::flags::ModelFlag;
 use super::{UsageError, not_an_input, print};
 
 /// Variable with the interpreter for `--verify`.
 const PYTHON_VARIABLE: &str = "DEMC_PYTHON";
+/// Value of `--albedo-filter` that removes the filter.
+const NO_FILTER: &str = "none";
 
 /// Export a model as one file: safetensors or an ONNX graph.
 ///
@@ -26,7 +28,8 @@ const PYTHON_VARIABLE: &str = "DEMC_PYTHON";
 #[command(after_help = "Examples:
   demc-infer export --model runs/demc -o demc.safetensors
   demc-infer export --model runs/demc --names torch --precision f16 -o demc-torch.safetensors
-  demc-infer export --model runs/demc --format onnx --verify -o demc.onnx")]
+  demc-infer export --model runs/demc --format onnx --verify -o demc.onnx
+  demc-infer export --model runs/demc --albedo-filter runs/albedo -o demc-filtered.safetensors")]
 pub struct Arguments {
     #[command(flatten)]
     model: ModelFlag,
@@ -45,7 +48,11 @@ pub struct Arguments {
     /// cycles, fbksd, luxcore, or a TOML file
     #[arg(long, value_name = "PRESET|FILE")]
     layout: Option<String>,
-    /// Output file. An existing file is replaced, but never the model itself
+    /// Albedo filter to store instead of the model's own: a run directory, a checkpoint directory or an
+    /// exported file. A model that has a filter itself gives that one. `none`: no filter
+    #[arg(long, value_name = "MODEL|none")]
+    albedo_filter: Option<PathBuf>,
+    /// Output file. An existing file is replaced, but never a model that is read
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Run the file on synthetic images in ONNX Runtime or PyTorch and compare. Deviations above
@@ -81,7 +88,17 @@ impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let file = self.model.read()?;
         // Rounding to f16 cannot be undone, so an export must not replace its model.
-        not_an_input(&self.output, &[(&file.path, "the model")])?;
+        let mut inputs = vec![(file.path.as_path(), "the model")];
+        let filter = match &self.albedo_filter {
+            Some(path) if path != Path::new(NO_FILTER) => Some(BundleFile::read(path)?),
+            _ => None,
+        };
+        inputs.extend(
+            filter
+                .as_ref()
+                .map(|file| (&*file.path, "the albedo filter")),
+        );
+        not_an_input(&self.output, &inputs)?;
         let names = match self.names {
             NamesFlag::Burn => Names::Burn,
             NamesFlag::Torch => Names::Torch,
@@ -94,6 +111,11 @@ impl Arguments {
             PrecisionFlag::F16 => Precision::F16,
         };
         let mut bundle = file.into_bundle(&Device::flex())?;
+        match filter {
+            Some(filter) => bundle.set_albedo_filter(filter.into_bundle(&Device::flex())?)?,
+            None if self.albedo_filter.is_some() => bundle.albedo_filter = None,
+            None => {}
+        }
         if let Some(name) = &self.layout {
             let layout = ChannelLayout::resolve(name);
             bundle.meta.layout = layout.map_err(|error| UsageError(error.to_string()))?;
@@ -102,7 +124,7 @@ impl Arguments {
         match self.format {
             Format::Safetensors => {
                 bundle.export(&self.output, names, precision)?;
-                let tensors = bundle.model.weights().len();
+                let tensors = bundle.tensors(names).len();
                 print(&format!(
                     "{output}: {tensors} tensors, read back and compared"
                 ))?;

@@ -12,7 +12,8 @@ use super::{not_an_input, print};
 ///
 /// Only the tensors come from the file. Network, statistics, channel layout and step come from the
 /// model that training started from (--like), or from the file's own header. The file must have
-/// exactly the network's tensors, in f32 or f16. The result is read back and compared.
+/// exactly the network's tensors, in f32 or f16. A file without the tensors of an albedo filter gets
+/// the filter of --like. The result is read back and compared.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer export --model runs/demc --names torch -o demc.safetensors
@@ -42,7 +43,7 @@ impl Arguments {
         }
         not_an_input(&self.output, &inputs)?;
         let known = like.is_some();
-        let file = match BundleFile::import(&self.weights, like.map(|like| like.meta)) {
+        let file = match BundleFile::import(&self.weights, like) {
             Err(error @ BundleError::Foreign { .. }) if !known => {
                 anyhow::bail!(
                     "{error}; --like MODEL takes them from the model that training started from"
@@ -52,7 +53,7 @@ impl Arguments {
         };
         let bundle = file.into_bundle(&Device::flex())?;
         bundle.export(&self.output, Names::Burn, Precision::F32)?;
-        let tensors = bundle.model.weights().len();
+        let tensors = bundle.tensors(Names::Burn).len();
         let output = self.output.display();
         print(&format!(
             "{output}: {tensors} tensors, read back and compared"

@@ -40,22 +40,37 @@ struct ModelSummary {
     names: Names,
     precision: Precision,
     parameters: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    albedo_filter: Option<FilterSummary>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     tensors: Vec<(String, Vec<usize>)>,
+}
+
+#[derive(Serialize)]
+struct FilterSummary {
+    #[serde(flatten)]
+    meta: BundleMeta,
+    parameters: u64,
 }
 
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let source = self.model.read()?;
         let (file, names, precision) = (source.path.clone(), source.names, source.precision);
-        let Bundle { meta, .. } = source.into_bundle(&Device::flex())?;
-        let specs = meta.model.weight_specs().into_iter();
+        let bundle = source.into_bundle(&Device::flex())?;
         let tensors = match self.tensors {
-            true => specs
-                .map(|spec| (names.in_file(&spec), spec.shape))
-                .collect(),
+            true => bundle.tensors(names),
             false => Vec::new(),
         };
+        let Bundle {
+            meta,
+            albedo_filter,
+            ..
+        } = bundle;
+        let albedo_filter = albedo_filter.map(|filter| FilterSummary {
+            parameters: filter.meta.model.parameter_count(),
+            meta: filter.meta,
+        });
         let parameters = meta.model.parameter_count();
         let summary = ModelSummary {
             file,
@@ -63,6 +78,7 @@ impl Arguments {
             names,
             precision,
             parameters,
+            albedo_filter,
             tensors,
         };
         print(&match self.json {
@@ -84,6 +100,13 @@ impl ModelSummary {
         let style = format!("{:?}, {:?} names", self.precision, self.names);
         writeln!(t, "weights     {}", style.to_lowercase())?;
         writeln!(t, "gamma       {}", meta.normalizer.gamma)?;
+        if let Some(FilterSummary { meta, parameters }) = &self.albedo_filter {
+            let (model, step) = (meta.model, meta.step);
+            writeln!(
+                t,
+                "filter      albedo: {model}, step {step}, {parameters} parameters"
+            )?;
+        }
         let epsilon = meta.normalizer.albedo_demodulation_epsilon;
         let demodulation = epsilon.map_or("off".into(), |epsilon| format!("albedo + {epsilon}"));
         writeln!(t, "demodulate  {demodulation}")?;

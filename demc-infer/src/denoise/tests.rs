@@ -7,7 +7,7 @@ use super::*;
 use crate::bundle::testing::{bundle, frame};
 
 /// Largest difference of two images, relative to the largest value of the second.
-fn difference(image: &[f32], expected: &[f32]) -> f32 {
+pub(super) fn difference(image: &[f32], expected: &[f32]) -> f32 {
     assert_eq!(image.len(), expected.len());
     assert!(image.iter().all(|x| x.is_finite()));
     let largest = |values: &mut dyn Iterator<Item = f32>| values.fold(0.0, f32::max);
@@ -16,7 +16,7 @@ fn difference(image: &[f32], expected: &[f32]) -> f32 {
 }
 
 /// Denoises without a factor on the colour.
-fn denoise(
+pub(super) fn denoise(
     bundle: &Bundle,
     frame: &Frame,
     tiling: &Tiling,

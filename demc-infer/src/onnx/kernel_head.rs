@@ -34,13 +34,13 @@ impl GraphBuilder {
             let level = KERNEL_LEVELS - 1 - k;
             let all = self.conv(decoded, conv, None);
             let weights =
-                self.channels(&all, &format!("kernels.weights.{level}"), 0, KERNEL_LOGITS);
+                self.channels(&format!("kernels.weights.{level}"), &all, 0..KERNEL_LOGITS);
             let filtered = self.filtered(level, &scales[level], &weights, &neighbours);
             out = Some(match out {
                 None => filtered,
                 Some(coarse) => {
                     let name = format!("kernels.blend.{level}");
-                    let blend = self.channels(&all, &name, KERNEL_LOGITS, logits(level));
+                    let blend = self.channels(&name, &all, KERNEL_LOGITS..logits(level));
                     self.blended(level, &filtered, &coarse, &blend)
                 }
             });
@@ -114,13 +114,5 @@ impl GraphBuilder {
             ("strides", AttributeValue::Ints(&[2, 2])),
         ];
         self.node("AveragePool", name, &[image], &settings)
-    }
-
-    /// Channels from `first` to `end`.
-    fn channels(&mut self, x: &Value, name: &str, first: usize, end: usize) -> Value {
-        let bounds = [("start", first as i64), ("end", end as i64), ("axis", 1)]
-            .map(|(what, value)| self.integers(&format!("{name}.{what}"), &[value]));
-        let [start, end, axis] = &bounds;
-        self.node("Slice", name, &[x, start, end, axis], &[])
     }
 }

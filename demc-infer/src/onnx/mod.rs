@@ -11,6 +11,7 @@
 //! Two conversions need the whole image, and a batch may hold tiles, so the caller does them. The
 //! colour is multiplied by [`Bundle::input_scale`] and the output divided by it. Positions are
 //! mapped.
+//! An albedo filter of the bundle is the first part of the graph; it takes the same positions.
 //! Batch normalisation is folded into the convolutions. All variants have both inputs; color-only
 //! ignores the second. Inputs, outputs and all computations are float32; [`Precision::F16`] only
 //! affects the stored weights of the convolutions.
@@ -18,6 +19,7 @@
 //! The operator set is 17 (June 2022). Later ones change no operator used here except for added
 //! types, so a newer set would only exclude older runtimes.
 
+mod albedo;
 mod graph;
 mod kernel_head;
 mod network;
@@ -28,9 +30,9 @@ use std::io::Write;
 use std::path::Path;
 
 use demc_data::frame::FEATURE_NAMES;
-use demc_model::ModelConfig;
 use demc_model::config::{COLOR_CHANNELS, FEATURE_CHANNELS};
 
+use crate::bundle::Description;
 use crate::{Bundle, BundleError, Precision};
 use graph::GraphBuilder;
 use proto::{
@@ -53,7 +55,7 @@ pub const COLOR: &str = "color";
 pub const FEATURES: &str = "features";
 /// Name of the output.
 pub const OUTPUT: &str = "output";
-/// Metadata key of the bundle's header as JSON: model, normalizer, layout, step.
+/// Metadata key of the bundle's header as JSON: model, normalizer, layout, step, albedo filter.
 pub const META: &str = "demc";
 /// Metadata key of [`FEATURE_NAMES`] as JSON.
 pub const FEATURE_ORDER: &str = "demc.features";
@@ -81,7 +83,10 @@ impl Bundle {
     /// A weight beyond f16's range, a network too large for one file, or a path that cannot be
     /// written; [`BundleError::ReadBack`] if the file differs from what was written.
     pub fn export_onnx(&self, path: &Path, precision: Precision) -> Result<(), BundleError> {
-        check_size(&self.meta.model, precision)?;
+        let parameters = self
+            .networks()
+            .map(|bundle| bundle.meta.model.parameter_count());
+        check_size(parameters.sum(), precision)?;
         let model = self.onnx(precision)?;
         let bytes = model.encode_to_vec();
         demc_data::file::write_whole(path, |file| file.write_all(&bytes))?;
@@ -103,9 +108,15 @@ impl Bundle {
 
     fn onnx(&self, precision: Precision) -> Result<ModelProto, BundleError> {
         let bundle = self.rounded(precision)?;
-        let mut graph = GraphBuilder::new(precision, bundle.meta.model.weight_specs());
-        graph.denoise(&bundle.model, &bundle.meta.normalizer);
-        let mut graph = graph.finish();
+        let network = |bundle: &Bundle| {
+            let mut graph = GraphBuilder::new(precision, bundle.meta.model.weight_specs());
+            graph.denoise(&bundle.model, &bundle.meta.normalizer);
+            graph.finish()
+        };
+        let mut graph = network(&bundle);
+        if let Some(filter) = &bundle.albedo_filter {
+            graph = albedo::with_filter(graph, network(filter), precision);
+        }
         graph.name = "demc".into();
         graph.input = vec![
             image(COLOR, COLOR_CHANNELS, "Noisy radiance, linear HDR"),
@@ -131,19 +142,22 @@ impl Bundle {
                 version: OPSET,
             }],
             metadata_props: vec![
-                entry(META, json(serde_json::to_string(&bundle.meta))?),
+                entry(
+                    META,
+                    json(serde_json::to_string(&Description::of(&bundle)))?,
+                ),
                 entry(FEATURE_ORDER, json(serde_json::to_string(&FEATURE_NAMES))?),
             ],
         })
     }
 }
 
-fn check_size(config: &ModelConfig, precision: Precision) -> Result<(), BundleError> {
+fn check_size(parameters: u64, precision: Precision) -> Result<(), BundleError> {
     let bytes_per_value = match precision {
         Precision::F32 => 4,
         Precision::F16 => 2,
     };
-    match config.parameter_count() * bytes_per_value + OTHER_BYTES {
+    match parameters * bytes_per_value + OTHER_BYTES {
         bytes if bytes > MAX_BYTES => Err(BundleError::TooLargeForOnnx { bytes }),
         _ => Ok(()),
     }

@@ -8,21 +8,28 @@ use rand_chacha::rand_core::SeedableRng;
 
 use super::proto::{FLOAT16, GraphProto, NodeProto};
 use super::*;
-use crate::bundle::testing::bundle;
+use crate::bundle::testing::{bundle, filtered};
 
 fn graph(variant: Variant, precision: Precision) -> GraphProto {
-    let model = bundle(variant).onnx(precision).expect("a graph");
+    graph_of(&bundle(variant), precision)
+}
+
+fn graph_of(bundle: &Bundle, precision: Precision) -> GraphProto {
+    let model = bundle.onnx(precision).expect("a graph");
     model.graph.expect("there is one")
 }
 
-fn kernel_graph(variant: Variant) -> GraphProto {
-    let mut bundle = bundle(variant);
+/// The bundle with kernel heads, in its albedo filter too.
+fn with_kernels(bundle: &Bundle) -> Bundle {
+    let mut bundle = bundle.clone();
     bundle.meta.model.head = Head::Kernel;
     let mut rng = ChaCha8Rng::seed_from_u64(7);
     let device = burn::tensor::Device::flex();
     bundle.model = bundle.meta.model.init(&mut rng, [0.5; 3], &device);
-    let model = bundle.onnx(Precision::F32).expect("a graph");
-    model.graph.expect("there is one")
+    bundle.albedo_filter = bundle
+        .albedo_filter
+        .map(|filter| Box::new(with_kernels(&filter)));
+    bundle
 }
 
 fn count(graph: &GraphProto, op: &str) -> usize {
@@ -33,7 +40,14 @@ fn count(graph: &GraphProto, op: &str) -> usize {
 fn every_value_is_defined_once_and_before_its_use() {
     for variant in Variant::ALL {
         for precision in [Precision::F32, Precision::F16] {
-            for graph in [graph(variant, precision), kernel_graph(variant)] {
+            let filtered = filtered(variant, Variant::Demc);
+            let kernels = with_kernels(&filtered);
+            let graphs = [
+                graph(variant, precision),
+                graph_of(&filtered, precision),
+                graph_of(&kernels, precision),
+            ];
+            for graph in graphs {
                 let mut known: HashSet<&str> =
                     graph.input.iter().map(|v| v.name.as_str()).collect();
                 for constant in &graph.initializer {
@@ -69,6 +83,29 @@ fn the_graph_has_the_networks_layers_and_no_normalisation() {
     assert_eq!(count(&graph, "Concat"), 5);
     assert_eq!(count(&graph, "BatchNormalization"), 0);
     assert_eq!(count(&graph, "Cast"), 0);
+}
+
+/// The filter's values have a prefix; the main network's keep their names and their number.
+#[test]
+fn a_filter_is_the_first_part_of_the_graph() {
+    let plain = graph(Variant::Demc, Precision::F32);
+    let whole = graph_of(&filtered(Variant::Demc, Variant::Semc), Precision::F32);
+    let filter = graph(Variant::Semc, Precision::F32);
+    let names = |graph: &GraphProto| -> Vec<String> {
+        let nodes = graph.node.iter().map(|node| node.name.clone());
+        nodes
+            .filter(|name| !name.starts_with("albedo_filter."))
+            .collect()
+    };
+    assert_eq!(names(&whole), names(&plain));
+    let layers = count(&plain, "Conv") + count(&filter, "Conv");
+    assert_eq!(count(&whole, "Conv"), layers);
+    let own = whole
+        .node
+        .iter()
+        .filter(|n| n.name.starts_with("albedo_filter."));
+    let first = own.clone().count();
+    assert!(whole.node[..first].iter().eq(own));
 }
 
 #[test]
@@ -120,9 +157,9 @@ fn a_weight_beyond_f16_is_named_and_nothing_is_written() {
 fn a_network_beyond_two_gibibytes_is_refused_before_it_is_built() {
     let mut config = bundle(Variant::Demc).meta.model;
     config.width = 64;
-    assert!(check_size(&config, Precision::F32).is_ok());
+    assert!(check_size(config.parameter_count(), Precision::F32).is_ok());
     config.width = 256;
-    let error = check_size(&config, Precision::F32).expect_err("2.7 GB");
+    let error = check_size(config.parameter_count(), Precision::F32).expect_err("2.7 GB");
     assert!(error.to_string().contains("export with f16"), "{error}");
-    assert!(check_size(&config, Precision::F16).is_ok());
+    assert!(check_size(config.parameter_count(), Precision::F16).is_ok());
 }

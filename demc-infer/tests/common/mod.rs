@@ -44,10 +44,8 @@ pub fn random_bundle() -> Bundle {
     };
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
     let mut rng = ChaCha8Rng::seed_from_u64(3);
-    Bundle {
-        model: model.init(&mut rng, normalizer.flat_color, &Device::flex()),
-        meta: BundleMeta::new(model, normalizer, layout, 500),
-    }
+    let network = model.init(&mut rng, normalizer.flat_color, &Device::flex());
+    Bundle::new(BundleMeta::new(model, normalizer, layout, 500), network)
 }
 
 /// The repository's sample data set.

@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use burn::tensor::Device;
 use demc_data::ranges::Ranges;
-use demc_infer::bundle::BundleFile;
+use demc_infer::bundle::{Bundle, BundleFile};
 use demc_model::{Denoiser, ModelConfig};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -18,6 +18,8 @@ use crate::run::checkpoint::store::sha256_of;
 pub struct InitialNetwork {
     /// The network.
     pub model: Denoiser,
+    /// The albedo filter of `train.init`, without autodiff. The run keeps it unchanged.
+    pub albedo_filter: Option<Box<Bundle>>,
     /// The source of its weights; `None` after random initialisation.
     pub weights: Option<InitialWeights>,
 }
@@ -76,6 +78,7 @@ pub fn initial_network(
     let Some(file) = read_init(config)? else {
         return Ok(InitialNetwork {
             model: random_network(&config.model, config.train.seed, flat_color, device),
+            albedo_filter: None,
             weights: None,
         });
     };
@@ -86,8 +89,14 @@ pub fn initial_network(
         albedo_demodulation_epsilon: file.meta.normalizer.albedo_demodulation_epsilon,
         ranges: file.meta.ranges.clone(),
     };
+    let Bundle {
+        model,
+        albedo_filter,
+        ..
+    } = file.into_bundle(device).context("train.init")?;
     Ok(InitialNetwork {
-        model: file.into_bundle(device).context("train.init")?.model,
+        model,
+        albedo_filter,
         weights: Some(weights),
     })
 }
@@ -96,7 +105,7 @@ pub fn initial_network(
 ///
 /// # Errors
 /// A file without a network; a network that differs from `[model]` or `data.gamma`, with each
-/// differing key.
+/// differing key; an albedo filter with another `data.position`.
 pub fn read_init(config: &Config) -> anyhow::Result<Option<BundleFile>> {
     let Some(init) = &config.train.init else {
         return Ok(None);
@@ -121,6 +130,11 @@ pub fn read_init(config: &Config) -> anyhow::Result<Option<BundleFile>> {
         init.display(),
         differences.join("; ")
     );
+    let filter = file.albedo_filter.as_deref();
+    let problem = filter.and_then(|filter| filter.meta.filter_problem(config.data.position));
+    if let Some(problem) = problem {
+        bail!("train.init: {}: {problem}", init.display());
+    }
     Ok(Some(file))
 }
 

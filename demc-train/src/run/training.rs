@@ -37,6 +37,8 @@ pub struct TrainingRun {
     dir: RunDir,
     source: Arc<PatchSource>,
     trainer: Trainer,
+    /// The albedo filter of `train.init`, in every bundle of the run.
+    albedo_filter: Option<Box<Bundle>>,
     state: LoopState,
     /// The weights of `train.init`, if the run is new.
     initial: Option<InitialWeights>,
@@ -72,7 +74,7 @@ impl TrainingRun {
     ) -> anyhow::Result<Self> {
         let device = device.clone().autodiff();
         let source = data.patch_source(&config)?;
-        let (model, average, optimizer, state, initial) = match checkpoint {
+        let (model, albedo_filter, average, optimizer, state, initial) = match checkpoint {
             Some(Checkpoint {
                 bundle,
                 average,
@@ -93,17 +95,26 @@ impl TrainingRun {
                     "{}: either the checkpoint or train.ema_decay has no weight average",
                     dir.path().display()
                 );
-                (bundle.model, average, optimizer, state, None)
+                let Bundle {
+                    model,
+                    albedo_filter,
+                    ..
+                } = bundle;
+                (model, albedo_filter, average, optimizer, state, None)
             }
             None => {
-                let InitialNetwork { model, weights } =
-                    initial_network(&config, data.normalizer.flat_color, &device)?;
+                let InitialNetwork {
+                    model,
+                    albedo_filter,
+                    weights,
+                } = initial_network(&config, data.normalizer.flat_color, &device)?;
                 let before = weights.as_ref().and_then(|weights| weights.ranges.as_ref());
                 if let Some(before) = before {
                     data.ranges = data.ranges.with(before);
                 }
                 (
                     model,
+                    albedo_filter,
                     None,
                     Optimizer::new(&config),
                     LoopState::start(),
@@ -118,6 +129,7 @@ impl TrainingRun {
             dir,
             source: Arc::new(source),
             trainer,
+            albedo_filter,
             state,
             initial,
             skipped_in_a_row: 0,
@@ -365,7 +377,11 @@ impl TrainingRun {
 
     fn bundle(&self, model: Denoiser) -> Bundle {
         let meta = self.data.meta(self.config.model, self.state.step);
-        Bundle { meta, model }
+        Bundle {
+            meta,
+            model,
+            albedo_filter: self.albedo_filter.clone(),
+        }
     }
 
     /// Scores the test split with the kept weights; `None` without test scenes. Writes `test.json`

@@ -111,6 +111,30 @@ pub fn assert_same_run(whole: &Path, other: &Path, what: &str) {
     }
 }
 
+/// Starts the run and kills it (SIGKILL) once its log has `lines` lines. Returns whether it was
+/// still running.
+pub fn kill_after(config: &Path, run: &Path, args: &[&str], lines: usize) -> bool {
+    let mut child = command(config, run, args)
+        .stdout(std::process::Stdio::null())
+        .spawn()
+        .expect("the binary runs");
+    let started = std::time::Instant::now();
+    while metrics(run).len() < lines {
+        assert!(
+            started.elapsed() < std::time::Duration::from_secs(300),
+            "no progress"
+        );
+        if child.try_wait().expect("a child").is_some() {
+            break;
+        }
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+    let killed = child.try_wait().expect("a child").is_none();
+    let _ = child.kill();
+    child.wait().expect("a child");
+    killed
+}
+
 /// Waits until `done`, at most two minutes.
 pub fn wait_until(mut done: impl FnMut() -> bool) {
     let started = std::time::Instant::now();

@@ -130,12 +130,9 @@ pub fn random_bundle(
         flat_color: [0.5, 0.4, 0.3],
     };
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
-    Bundle {
-        model: config
-            .load(&mut Weights::new(weights), &device)
-            .expect("its own weights"),
-        meta: BundleMeta::new(config, normalizer, layout, 0),
-    }
+    let model = config.load(&mut Weights::new(weights), &device);
+    let model = model.expect("its own weights");
+    Bundle::new(BundleMeta::new(config, normalizer, layout, 0), model)
 }
 
 /// Random values.

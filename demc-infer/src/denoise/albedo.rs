@@ -1,0 +1,59 @@
+//! The albedo filter: a second network denoises the albedo of the first hit before the first one
+//! sees it.
+//!
+//! The filter sees the padded image with the frame's features, as in the ONNX graph and in Python. Its
+//! colour is the albedo, clamped to 0 to 1, without a factor and without test-time augmentation.
+
+use std::rc::Rc;
+
+use demc_data::frame::TEXTURES;
+use demc_data::transform::MAX_ALBEDO;
+use demc_model::config::COLOR_CHANNELS;
+
+use super::{DenoiseError, FrameInput};
+use crate::ensemble::Ensemble;
+use crate::tiles::{EXACT_HALO, Tiling};
+
+impl FrameInput<'_> {
+    /// Replaces the albedo of the first hit by the filter's output. A bundle without a filter and a
+    /// constant albedo, as of a file that lacks it, change nothing.
+    ///
+    /// # Errors
+    /// The filter's smallest tile does not fit into memory, the device fails, or its output is not
+    /// finite.
+    pub(super) fn filter_albedo(&mut self, tiling: &Tiling) -> Result<(), DenoiseError> {
+        let frame = self.frame;
+        let pixels = frame.width * frame.height;
+        let albedo = &frame.features[TEXTURES * pixels..][..COLOR_CHANNELS * pixels];
+        let is_constant = |plane: &[f32]| plane.iter().all(|value| *value == plane[0]);
+        let Some(filter) = &self.bundle.albedo_filter else {
+            return Ok(());
+        };
+        if albedo.chunks_exact(pixels).all(is_constant) {
+            return Ok(());
+        }
+        let clamp = |value: &f32| value.clamp(0.0, MAX_ALBEDO);
+        let color: Vec<f32> = albedo.iter().map(clamp).collect();
+        let own = FrameInput {
+            color: &color,
+            // The filter takes the positions of the network ([`BundleMeta::filter_problem`]).
+            positions: self.positions,
+            ..FrameInput::new(filter, frame)?
+        };
+        let tiling = Tiling {
+            halo: EXACT_HALO,
+            ..*tiling
+        };
+        let tiles = filter.tiles(frame.height, frame.width, &tiling, Ensemble::One);
+        let tiles = tiles.map_err(|source| DenoiseError::Memory {
+            name: frame.name.clone(),
+            source,
+        })?;
+        let mut filtered = own.denoise_into(self.padded(), &tiles, |_, _| ())?;
+        for value in &mut filtered {
+            *value = value.min(MAX_ALBEDO);
+        }
+        self.albedo = Some(Rc::from(filtered));
+        Ok(())
+    }
+}
