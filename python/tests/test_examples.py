@@ -93,14 +93,18 @@ class Examples(unittest.TestCase):
                 self.assertIn(message, done.stderr)
 
     def test_fine_tuned_weights_are_imported(self) -> None:
-        tuned, imported = self.folder / "tuned.safetensors", self.folder / "imported.safetensors"
+        names = "filtered", "tuned", "imported"
+        filtered, tuned, imported = (self.folder / f"{name}.safetensors" for name in names)
+        options = "--names", "torch", "--albedo-filter", self.models["torch"]
+        self.succeed("demc-infer", "export", *options, "-o", filtered)
         script = PACKAGE / "examples" / "finetune.py"
         options = "--steps", "3", "--batch", "2"
-        text = self.succeed(sys.executable, script, self.models["torch"], tuned, "--data", SAMPLE, *options)
+        text = self.succeed(sys.executable, script, filtered, tuned, "--data", SAMPLE, *options)
         self.assertIn("step 3: RelMSE ", text)
         self.succeed("demc-infer", "import", tuned, "-o", imported)
-        meta = [json.loads(self.succeed("demc-infer", "inspect", "--json", "--model", path)) for path in (self.models["torch"], imported)]
+        meta = [json.loads(self.succeed("demc-infer", "inspect", "--json", "--model", path)) for path in (filtered, imported)]
         self.assertEqual(meta[1]["step"], meta[0]["step"] + 3)
+        self.assertEqual(meta[1]["albedo_filter"], meta[0]["albedo_filter"])
 
         done = run(sys.executable, script, self.models["torch"], tuned, "--data", self.folder)
         self.assertEqual((done.returncode, done.stderr.count("\n")), (1, 1), done.stderr)
