@@ -83,12 +83,13 @@ class Bundle:
     def with_filtered_albedo(self, features: Tensor) -> Tensor:
         """Prepared features [B, 12, H, W] with the albedo (first hit) that the network sees.
 
-        An image of constant albedo and a bundle without a filter keep theirs.
+        An image of constant albedo, pixels with albedo 0, and a bundle without a filter keep theirs.
         """
         if self.albedo_filter is None:
             return features
         noisy = features[:, 6:9]
         filtered = self.albedo_filter.radiance(noisy.clamp(0, MAX_ALBEDO), features).clamp(0, MAX_ALBEDO)
+        filtered = filtered * (noisy > 0).any(1, True)
         varies = (noisy.amax((2, 3), True) > noisy.amin((2, 3), True)).any(1, True)
         return torch.cat((features[:, :6], torch.where(varies, filtered, noisy), features[:, 9:]), 1)
 

@@ -16,7 +16,7 @@ use crate::tiles::{EXACT_HALO, Tiling};
 
 impl FrameInput<'_> {
     /// Replaces the albedo of the first hit by the filter's output. A bundle without a filter and a
-    /// constant albedo, as of a file that lacks it, change nothing.
+    /// constant albedo, as of a file that lacks it, change nothing. Pixels with albedo 0 keep it.
     ///
     /// # Errors
     /// The filter's smallest tile does not fit into memory, the device fails, or its output is not
@@ -50,8 +50,16 @@ impl FrameInput<'_> {
             source,
         })?;
         let mut filtered = own.denoise_into(self.padded(), &tiles, |_, _| ())?;
-        for value in &mut filtered {
-            *value = value.min(MAX_ALBEDO);
+        let noisy = self.padding.pad(&color);
+        let pixels = filtered.len() / COLOR_CHANNELS;
+        for (i, value) in filtered.iter_mut().enumerate() {
+            let mut channels =
+                (0..COLOR_CHANNELS).map(|channel| noisy[channel * pixels + i % pixels]);
+            // Without a surface there is nothing to filter; neighbours would bleed in.
+            *value = match channels.any(|albedo| albedo > 0.0) {
+                true => value.min(MAX_ALBEDO),
+                false => 0.0,
+            };
         }
         self.albedo = Some(Rc::from(filtered));
         Ok(())

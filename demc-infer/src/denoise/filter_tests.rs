@@ -41,8 +41,10 @@ fn filtered_by_hand(bundle: &Bundle, original: &Frame) -> Frame {
     let filter = bundle.albedo_filter.as_ref().expect("a filter");
     let image = denoise(filter, &noisy, &Tiling::default(), Ensemble::One);
     let image = image.expect("denoised").color_hdr;
-    for (value, filtered) in albedo(&mut padded).iter_mut().zip(image) {
-        *value = filtered.min(1.0);
+    let pixels = padded.width * padded.height;
+    for (i, (value, filtered)) in albedo(&mut padded).iter_mut().zip(image).enumerate() {
+        let has_surface = (0..3).any(|channel| noisy.color[channel * pixels + i % pixels] > 0.0);
+        *value = if has_surface { filtered.min(1.0) } else { 0.0 };
     }
     padded
 }
@@ -60,6 +62,10 @@ fn the_filters_image_replaces_the_albedo() {
         let mut original = frame(width, height);
         albedo(&mut original)[0] = 9.0;
         albedo(&mut original)[1] = -9.0;
+        for channel in 0..3 {
+            // Pixel 2 has no surface.
+            albedo(&mut original)[channel * width * height + 2] = 0.0;
+        }
         let alpha = |size: usize| (0..size).map(|i| (i % 7) as f32 / 7.0).collect();
         original.alpha = Some(alpha(width * height));
         let by_hand = filtered_by_hand(&bundle, &original);

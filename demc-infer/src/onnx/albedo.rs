@@ -33,8 +33,12 @@ pub(super) fn with_filter(
     let mut after = GraphBuilder::new(precision, Vec::new());
     let output = Value(named(OUTPUT));
     let clipped = after.node("Clip", &named("clipped"), &[&output, low, high], &[]);
-    // Whether any channel varies over the image.
     let over = |axes: &'static [usize]| [("axes", AttributeValue::Ints(axes))];
+    // Pixels with albedo 0, which have no surface, keep it.
+    let brightest = after.node("ReduceMax", &named("brightest"), &[&albedo], &over(&[1]));
+    let surface = after.node("Greater", &named("surface"), &[&brightest, low], &[]);
+    let clipped = after.node("Where", &named("kept"), &[&surface, &clipped, low], &[]);
+    // Whether any channel varies over the image.
     let most = after.node("ReduceMax", &named("most"), &[&albedo], &over(&[2, 3]));
     let least = after.node("ReduceMin", &named("least"), &[&albedo], &over(&[2, 3]));
     let span = after.node("Sub", &named("span"), &[&most, &least], &[]);
