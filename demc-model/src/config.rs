@@ -147,6 +147,11 @@ impl VariantSpec {
             .iter()
             .any(|inputs| inputs.contains(&Input::DetailMap))
     }
+
+    /// Whether the features have any effect: whether an encoder takes more than the colour as input.
+    pub fn takes_features(&self) -> bool {
+        self.encoders.iter().any(|inputs| *inputs != [Input::Color])
+    }
 }
 
 /// A row of the table of readings.
@@ -320,6 +325,8 @@ mod tests {
     fn only_variants_with_a_detail_map_have_a_fusion() {
         let has_fusion = Variant::ALL.map(|variant| variant.spec().has_fusion());
         assert_eq!(has_fusion, [true, false, true, false]);
+        let takes_features = Variant::ALL.map(|variant| variant.spec().takes_features());
+        assert_eq!(takes_features, [true, true, true, false]);
     }
 
     #[test]

@@ -4,7 +4,7 @@
 //! The filter sees the padded image with the frame's features, as in the ONNX graph and in Python. Its
 //! colour is the albedo, clamped to 0 to 1, without a factor and without test-time augmentation.
 
-use std::rc::Rc;
+use std::sync::Arc;
 
 use demc_data::frame::TEXTURES;
 use demc_data::transform::MAX_ALBEDO;
@@ -61,7 +61,7 @@ impl FrameInput<'_> {
                 false => 0.0,
             };
         }
-        self.albedo = Some(Rc::from(filtered));
+        self.albedo = Some(Arc::from(filtered));
         Ok(())
     }
 }

@@ -1,12 +1,13 @@
 //! One frame as the network's input: tiles, conversions, and the passes over them.
 
-use std::rc::Rc;
+use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_data::frame::TEXTURES;
 use demc_data::transform::exposure_scale;
 use demc_data::{FEATURES, Frame, PositionMap};
 use demc_model::config::COLOR_CHANNELS;
+use rayon::prelude::*;
 
 use super::DenoiseError;
 use crate::Bundle;
@@ -27,7 +28,7 @@ pub(super) struct FrameInput<'a> {
     /// The image that is denoised, planar `[3, H, W]`: the frame's colour, or its alpha as grey.
     pub(super) color: &'a [f32],
     /// The filtered albedo of the first hit, which replaces the frame's: planar, padded `[3, H, W]`.
-    pub(super) albedo: Option<Rc<[f32]>>,
+    pub(super) albedo: Option<Arc<[f32]>>,
     pub(super) padding: Padding,
     pub(super) device: Device,
     pub(super) ensemble: Ensemble,
@@ -166,28 +167,49 @@ impl<'a> FrameInput<'a> {
     ) -> Result<Vec<f32>, DenoiseError> {
         let normalizer = &self.bundle.meta.normalizer;
         let mut color = self.padding.cut(self.color, rows.clone(), columns.clone());
-        color.iter_mut().for_each(|value| *value *= self.scale);
-        let mut features = self.features(rows, columns);
-        let modulation = match self.demodulate {
-            true => normalizer.modulation(&features),
-            false => None,
-        };
-        normalizer.color_gamma_from_hdr(&mut color, modulation.as_deref());
-        normalizer.features_z_from_raw(&mut features);
+        let (modulation, features_z) = self.modulation_and_features(rows, columns);
+        in_pieces(&mut color, modulation.as_deref(), |color, modulation| {
+            color.iter_mut().for_each(|value| *value *= self.scale);
+            normalizer.color_gamma_from_hdr(color, modulation);
+        });
         let color_gamma = self.tensor::<COLOR_CHANNELS>(color, rows, columns);
-        let features_z = self.tensor::<FEATURES>(features, rows, columns);
         let out = self
             .ensemble
             .mean([color_gamma, features_z], |[color, features]| {
                 self.bundle.model.forward(color, features)
             });
         let mut out = self.read(out)?;
-        // The conversion to HDR would turn NaN into 0.
-        let nan: Vec<usize> = (0..out.len()).filter(|i| out[*i].is_nan()).collect();
-        normalizer.color_hdr_from_gamma(&mut out, modulation.as_deref());
-        nan.into_iter().for_each(|i| out[i] = f32::NAN);
-        out.iter_mut().for_each(|value| *value /= self.scale);
+        in_pieces(&mut out, modulation.as_deref(), |out, modulation| {
+            // The conversion to HDR would turn NaN into 0.
+            let nan: Vec<usize> = (0..out.len()).filter(|i| out[*i].is_nan()).collect();
+            normalizer.color_hdr_from_gamma(out, modulation);
+            nan.into_iter().for_each(|i| out[i] = f32::NAN);
+            out.iter_mut().for_each(|value| *value /= self.scale);
+        });
         Ok(out)
+    }
+
+    /// The [modulation](demc_data::Normalizer::modulation) and the Z-scored features of a tile. A
+    /// network without features gets zeros.
+    fn modulation_and_features(
+        &self,
+        rows: &PixelRange,
+        columns: &PixelRange,
+    ) -> (Option<Vec<f32>>, Tensor<4>) {
+        let meta = &self.bundle.meta;
+        let demodulates = meta.normalizer.albedo_demodulation_epsilon.is_some();
+        if !demodulates && !meta.model.variant.spec().takes_features() {
+            let shape = [1, FEATURES, rows.len(), columns.len()];
+            return (None, Tensor::<4>::zeros([1; 4], &self.device).expand(shape));
+        }
+        let mut features = self.features(rows, columns);
+        let modulation = match self.demodulate {
+            true => meta.normalizer.modulation(&features),
+            false => None,
+        };
+        meta.normalizer.features_z_from_raw(&mut features);
+        let features_z = self.tensor::<FEATURES>(features, rows, columns);
+        (modulation, features_z)
     }
 
     fn features(&self, rows: &PixelRange, columns: &PixelRange) -> Vec<f32> {
@@ -227,4 +249,23 @@ impl<'a> FrameInput<'a> {
                 source,
             })
     }
+}
+
+/// Values that a thread converts at a time.
+const PIECE: usize = 1 << 15;
+
+/// Runs `work` on pieces of the values and their modulation, on several threads.
+fn in_pieces(
+    values: &mut [f32],
+    modulation: Option<&[f32]>,
+    work: impl Fn(&mut [f32], Option<&[f32]>) + Sync,
+) {
+    let pieces = values.par_chunks_mut(PIECE).enumerate();
+    pieces.for_each(|(piece, values)| {
+        let first = piece * PIECE;
+        work(
+            values,
+            modulation.map(|all| &all[first..first + values.len()]),
+        );
+    });
 }

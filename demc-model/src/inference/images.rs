@@ -27,8 +27,8 @@ fn host(tensor: Tensor<4>) -> FlexTensor {
 }
 
 impl InputImages {
-    /// The images `[B, 3, H, W]` and `[B, 12, H, W]` on `flex`.
-    pub(super) fn new(color_gamma: Tensor<4>, features_z: Tensor<4>) -> Self {
+    /// The images `[B, 3, H, W]` and, for a network that takes them, `[B, 12, H, W]` on `flex`.
+    pub(super) fn new(color_gamma: Tensor<4>, features_z: Option<Tensor<4>>) -> Self {
         let [batch, _, height, width] = color_gamma.dims();
         InputImages {
             grid: Grid {
@@ -37,7 +37,7 @@ impl InputImages {
                 width,
             },
             color: host(color_gamma),
-            features: Some(host(features_z)),
+            features: features_z.map(host),
         }
     }
 

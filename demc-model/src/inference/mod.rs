@@ -80,7 +80,8 @@ fn forward_with(
         plan,
         model,
     };
-    let images = InputImages::new(color_gamma, features_z);
+    let takes_features = model.config().variant.spec().takes_features();
+    let images = InputImages::new(color_gamma, takes_features.then_some(features_z));
     let (grid, color) = (images.grid, images.color());
     let encoded = pass.encode(images);
     let head = KernelHead::new(pass.isa, model, grid, &color);
