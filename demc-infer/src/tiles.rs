@@ -48,6 +48,14 @@ impl Tiling {
         self.halo >= EXACT_HALO
     }
 
+    /// The same options with the exact halo.
+    pub fn exact(&self) -> Self {
+        Self {
+            halo: EXACT_HALO,
+            ..*self
+        }
+    }
+
     /// The halo, rounded up to the network's grid.
     fn grid_halo(&self) -> usize {
         self.halo.next_multiple_of(DOWNSAMPLING)

@@ -244,8 +244,6 @@ impl BundleFile {
                 WeightsError::Missing { name }
                 | WeightsError::Shape { name, .. }
                 | WeightsError::Unknown { name, .. } => name.insert_str(0, prefix),
-                #[allow(unreachable_patterns, reason = "the enum may grow")]
-                _ => {}
             }
             BundleError::Weights { path, source }
         })?;

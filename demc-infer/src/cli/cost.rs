@@ -128,9 +128,10 @@ fn image(
     let (tall, wide) = tiles.largest();
     let padded = height.next_multiple_of(DOWNSAMPLING) * width.next_multiple_of(DOWNSAMPLING);
     let (mut flops, mut flops_whole) = (0.0, 0.0);
-    for network in bundle.networks() {
+    // The albedo filter's tiles are always exact.
+    for (network, tiling) in bundle.networks().zip([*tiling, tiling.exact()]) {
         let per_pixel = network.meta.model.flops_per_pixel();
-        let tiles = network.tiles(height, width, tiling, Ensemble::One)?;
+        let tiles = network.tiles(height, width, &tiling, Ensemble::One)?;
         flops += per_pixel * tiles.computed_pixels() as f64;
         flops_whole += per_pixel * padded as f64;
     }

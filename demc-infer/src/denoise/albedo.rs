@@ -12,7 +12,7 @@ use demc_model::config::COLOR_CHANNELS;
 
 use super::{DenoiseError, FrameInput};
 use crate::ensemble::Ensemble;
-use crate::tiles::{EXACT_HALO, Tiling};
+use crate::tiles::Tiling;
 
 impl FrameInput<'_> {
     /// Replaces the albedo of the first hit by the filter's output. A bundle without a filter and a
@@ -40,11 +40,7 @@ impl FrameInput<'_> {
             positions: self.positions,
             ..FrameInput::new(filter, frame)?
         };
-        let tiling = Tiling {
-            halo: EXACT_HALO,
-            ..*tiling
-        };
-        let tiles = filter.tiles(frame.height, frame.width, &tiling, Ensemble::One);
+        let tiles = filter.tiles(frame.height, frame.width, &tiling.exact(), Ensemble::One);
         let tiles = tiles.map_err(|source| DenoiseError::Memory {
             name: frame.name.clone(),
             source,
