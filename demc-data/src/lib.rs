@@ -23,6 +23,7 @@ pub mod augment;
 pub mod batch;
 pub mod cache;
 pub mod channel;
+pub mod checksum;
 pub mod config;
 pub mod dataset;
 pub mod doctor;

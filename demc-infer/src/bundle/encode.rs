@@ -8,6 +8,7 @@ use half::slice::HalfFloatSliceExt;
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
 
+use super::checksum::{SummedTensor, of_bundle};
 use super::tensors::{EncodedTensor, f32_bytes, serialize};
 use super::{BundleError, BundleMeta};
 
@@ -83,12 +84,19 @@ impl Precision {
     }
 }
 
-/// The header entry: the metadata and the naming scheme.
+/// The header entry: the metadata, the naming scheme and the checksum.
 #[derive(Serialize)]
 struct Header<'a> {
     #[serde(flatten)]
     meta: &'a BundleMeta,
     names: Names,
+    sha256: &'a str,
+}
+
+impl Header<'_> {
+    fn to_json(&self) -> Result<String, BundleError> {
+        serde_json::to_string(self).map_err(|error| BundleError::Encode(error.to_string()))
+    }
 }
 
 /// The bytes of a bundle file. safetensors sorts tensors by type and name, so equal inputs give
@@ -102,8 +110,6 @@ pub(super) fn encode(
     names: Names,
     precision: Precision,
 ) -> Result<Vec<u8>, BundleError> {
-    let header = serde_json::to_string(&Header { meta, names });
-    let header = header.map_err(|error| BundleError::Encode(error.to_string()))?;
     let mut tensors = Vec::with_capacity(weights.len());
     for (weight, spec) in weights.into_iter().zip(meta.model.weight_specs()) {
         debug_assert_eq!(weight.name, spec.name);
@@ -118,7 +124,17 @@ pub(super) fn encode(
             shape: weight.shape,
         });
     }
-    let metadata = HashMap::from([(KEY.to_string(), header)]);
+    let mut header = Header {
+        meta,
+        names,
+        sha256: "",
+    };
+    let summed = tensors
+        .iter()
+        .map(|tensor| SummedTensor::new(&tensor.name, tensor.dtype, &tensor.shape, &tensor.bytes));
+    let sum = of_bundle(&header.to_json()?, summed.collect());
+    header.sha256 = &sum;
+    let metadata = HashMap::from([(KEY.to_string(), header.to_json()?)]);
     serialize(&tensors, Some(metadata)).map_err(BundleError::Encode)
 }
 

@@ -1,5 +1,6 @@
 //! Reads a bundle file: header and tensors, without building the network.
 
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
@@ -9,15 +10,19 @@ use demc_model::Weight;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, Metadata};
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 
 use super::encode::KEY;
 use super::tensors::{one_line, values};
-use super::{BundleError, BundleMeta, FORMAT, Names, Precision, locate};
+use super::{BundleError, BundleMeta, FORMAT, Names, Precision, checksum, locate};
 
 /// Longest accepted header in bytes (ours: the widest network's has 20 kB).
 const MAX_HEADER: u64 = 4 << 20;
 /// Size of the field before the header that holds its length, in bytes.
 const LENGTH: usize = 8;
+
+/// The keys of [`BundleMeta`].
+const META_KEYS: [&str; 6] = ["format", "model", "normalizer", "layout", "step", "ranges"];
 
 /// The contents of a bundle file, validated as far as possible without building the network.
 #[derive(Debug, Clone)]
@@ -41,10 +46,15 @@ impl BundleFile {
     /// - The file cannot be read, is cut short, is no bundle, or has another format.
     /// - A tensor has a type other than f32 and f16, or holds NaN or infinity.
     /// - A standard deviation is zero, or another entry of the header is invalid.
+    /// - The content differs from the checksum in the header or, for a directory, in the
+    ///   checkpoint's `SHA256SUMS`.
     pub fn read(path: &Path) -> Result<Self, BundleError> {
-        let path = locate::locate(path)?;
-        let bytes = read(&path)?;
-        Self::parse(path, &bytes)
+        let file = locate::locate(path)?;
+        let bytes = read(&file)?;
+        if file != path {
+            checksum::check_in_checkpoint(&file, &bytes)?;
+        }
+        Self::parse(file, &bytes)
     }
 
     /// Parses the bytes of a bundle file. Errors call it `path`.
@@ -52,8 +62,12 @@ impl BundleFile {
     /// # Errors
     /// As [`read`](Self::read), except for reading.
     pub fn parse(path: PathBuf, bytes: &[u8]) -> Result<Self, BundleError> {
-        let (meta, names) = parse_meta(&path, bytes)?;
+        let header = parse_meta(&path, bytes)?;
         let tensors = SafeTensors::deserialize(bytes).map_err(|error| damaged(&path, &error))?;
+        if let Some(sum) = &header.sha256 {
+            checksum::check(&path, &header.entry, sum, &tensors)?;
+        }
+        let BundleHeader { meta, names, .. } = header;
         let mut precision = Precision::F32;
         let mut weights = Vec::with_capacity(tensors.len());
         let mut specs = names.specs_in_file(&meta.model);
@@ -137,16 +151,26 @@ pub(super) fn damaged(path: &Path, error: &safetensors::SafeTensorError) -> Bund
 ///
 /// # Errors
 /// The bytes are no safetensors file, or no bundle.
-pub(super) fn parse_meta(path: &Path, bytes: &[u8]) -> Result<(BundleMeta, Names), BundleError> {
+pub(super) fn parse_meta(path: &Path, bytes: &[u8]) -> Result<BundleHeader, BundleError> {
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|error| damaged(path, &error))?;
     let entry = header.metadata().as_ref().and_then(|all| all.get(KEY));
     let entry = entry.ok_or_else(|| BundleError::Foreign { path: path.into() })?;
     parse_header(entry, path)
 }
 
+/// The header entry of a bundle file.
+pub(super) struct BundleHeader {
+    pub meta: BundleMeta,
+    pub names: Names,
+    /// The checksum, if the file has one.
+    pub sha256: Option<String>,
+    /// The entry as it stands in the file.
+    pub entry: String,
+}
+
 /// Parses the header entry. The format is checked first, because another format may have other
 /// keys.
-fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleError> {
+fn parse_header(entry: &str, path: &Path) -> Result<BundleHeader, BundleError> {
     #[derive(Deserialize)]
     struct Version {
         format: u64,
@@ -154,6 +178,9 @@ fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleE
     #[derive(Deserialize)]
     struct Style {
         names: Names,
+        sha256: Option<String>,
+        #[serde(flatten)]
+        rest: BTreeMap<String, IgnoredAny>,
     }
     let invalid = |detail: String| BundleError::Header {
         path: path.into(),
@@ -167,14 +194,26 @@ fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleE
             found: format,
         });
     }
-    let Style { names } = serde_json::from_str(entry).map_err(json)?;
+    let Style {
+        names,
+        sha256,
+        rest,
+    } = serde_json::from_str(entry).map_err(json)?;
     let meta: BundleMeta = serde_json::from_str(entry).map_err(json)?;
     let mut problems = meta.model.validate();
+    // One of them could be a damaged `sha256`.
+    let unknown = rest.keys().filter(|key| !META_KEYS.contains(&key.as_str()));
+    problems.extend(unknown.map(|key| format!("unknown key `{key}`")));
     problems.extend(statistics_problems(&meta));
     let layout = meta.layout.validate().into_iter();
     problems.extend(layout.map(|problem| format!("layout: {problem}")));
     match problems.is_empty() {
-        true => Ok((meta, names)),
+        true => Ok(BundleHeader {
+            meta,
+            names,
+            sha256,
+            entry: entry.to_owned(),
+        }),
         false => Err(invalid(problems.join("; "))),
     }
 }

@@ -44,7 +44,8 @@ impl BundleFile {
     /// Reads the weights of a network from the safetensors file `path`, with PyTorch's or Burn's
     /// names.
     ///
-    /// `like` describes the network. Without it, the file's own header must.
+    /// `like` describes the network. Without it, the file's own header must. The checksum in the
+    /// header is not compared: whoever imports a file has changed its weights.
     ///
     /// # Errors
     /// - The file cannot be read or is no safetensors file.
@@ -55,7 +56,7 @@ impl BundleFile {
         let bytes = read(path)?;
         let meta = match like {
             Some(meta) => meta,
-            None => parse_meta(path, &bytes)?.0,
+            None => parse_meta(path, &bytes)?.meta,
         };
         let file = SafeTensors::deserialize(&bytes).map_err(|error| damaged(path, &error))?;
         let mut found: BTreeMap<String, _> = file
