@@ -25,6 +25,7 @@ pub mod cache;
 pub mod channel;
 pub mod checksum;
 pub mod config;
+pub mod content;
 pub mod dataset;
 pub mod doctor;
 pub mod dropout;

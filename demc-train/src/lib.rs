@@ -14,5 +14,6 @@ pub mod record;
 pub mod run;
 pub mod step;
 pub mod tools;
+pub mod usage;
 
 pub use config::Config;

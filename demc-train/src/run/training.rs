@@ -2,7 +2,6 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use burn::module::Module;
@@ -20,7 +19,9 @@ use crate::run::checkpoint::store::{CheckpointRetention, CheckpointStore};
 use crate::run::checkpoint::{self, BestValidation, Checkpoint, LoopState, MetricSums};
 use crate::run::data::RunData;
 use crate::run::initial::{InitialNetwork, InitialWeights, initial_network};
-use crate::run::run_dir::{RunDir, RunFacts};
+use crate::run::run_dir::RunDir;
+use crate::run::run_record::RunFacts;
+use crate::run::session_clock::SessionClock;
 use crate::run::signals::Signals;
 use crate::run::validation::{self, Validation};
 use crate::run::warnings::LoopFacts;
@@ -148,7 +149,8 @@ impl TrainingRun {
     /// record.
     ///
     /// # Errors
-    /// A scene that cannot be read; a file that cannot be written; a non-finite loss.
+    /// A scene that cannot be read; a file that cannot be written; a non-finite loss in a step
+    /// that may not be skipped, or in all steps.
     pub fn train(&mut self, device: &str) -> anyhow::Result<LoopEnd> {
         let mut recorder = self.open_records(device)?;
         let (train, run) = (self.config.train.clone(), self.config.run.clone());
@@ -196,7 +198,18 @@ impl TrainingRun {
             }
         }
         recorder.finish();
+        ensure!(
+            !self.is_untrained(),
+            "all {} steps were skipped because of a non-finite loss or gradient, so the network is untrained; \
+             inspect the data with demc-data doctor, or try a smaller optimizer.lr_start",
+            self.state.step
+        );
         Ok(LoopEnd::Done)
+    }
+
+    /// Whether no step has changed the weights.
+    fn is_untrained(&self) -> bool {
+        self.state.skipped == self.state.step
     }
 
     fn open_records(&mut self, device: &str) -> anyhow::Result<Recorder> {
@@ -207,9 +220,9 @@ impl TrainingRun {
             patches: self.patches(),
             initial: self.initial.as_ref(),
         };
-        let note = self.dir.open(&self.config, &self.data, facts)?;
+        let notes = self.dir.open(&self.config, &self.data, facts)?;
         let recorder = Recorder::open(&self.dir, &self.config, self.state.step, self.patches())?;
-        if let Some(note) = note {
+        for note in notes {
             recorder.say(&format!("note: {note}"));
         }
         Ok(recorder)
@@ -291,7 +304,7 @@ impl TrainingRun {
 
     /// Scores and draws the validation scenes, and keeps the weights if they are the best so far.
     fn validate(&mut self, recorder: &mut Recorder) -> anyhow::Result<Option<Validation>> {
-        if self.data.validation.is_empty() {
+        if self.data.validation.is_empty() || self.is_untrained() {
             return Ok(None);
         }
         let bundle = self.bundle(self.trainer.result());
@@ -390,39 +403,5 @@ impl TrainingRun {
         self.dir
             .write("test.json", &serde_json::to_vec_pretty(&report)?)?;
         Ok(Some((bundle.meta.step, report)))
-    }
-}
-
-/// The duration of a run over its sessions, and the time since the last checkpoint.
-struct SessionClock {
-    started: Instant,
-    /// Seconds of earlier sessions.
-    before: f64,
-    saved: Instant,
-    interval: Duration,
-}
-
-impl SessionClock {
-    fn new(before: f64, interval: Duration) -> Self {
-        let now = Instant::now();
-        SessionClock {
-            started: now,
-            before,
-            saved: now,
-            interval,
-        }
-    }
-
-    fn elapsed(&self) -> f64 {
-        self.before + self.started.elapsed().as_secs_f64()
-    }
-
-    fn checkpoint_saved(&mut self) {
-        self.saved = Instant::now();
-    }
-
-    /// Whether `run.checkpoint_minutes` have passed.
-    fn checkpoint_is_due(&self) -> bool {
-        self.saved.elapsed() >= self.interval
     }
 }
