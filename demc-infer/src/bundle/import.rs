@@ -45,7 +45,7 @@ impl BundleFile {
     /// names.
     ///
     /// `like` describes the network. Without it, the file's own header must. The checksum in the
-    /// header is not compared: whoever imports a file has changed its weights.
+    /// header is not compared, because imported weights were usually changed on purpose.
     ///
     /// # Errors
     /// - The file cannot be read or is no safetensors file.

@@ -227,7 +227,7 @@ mod tests {
     fn a_damaged_line_costs_that_line_alone() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("metrics.jsonl");
-        let intact = [b"{\"step\":1}\n", b"{\"step\":3}\n"];
+        let intact: [&[u8]; 2] = [b"{\"step\":1}\n", b"{\"step\":3}\n"];
         let damaged: [&[u8]; 4] = [b"\xff\x00\n", b"{\"step\":-2}\n", b"[]\n", b"\n"];
         for line in damaged {
             fs::write(&path, [intact[0], line, intact[1]].concat()).unwrap();

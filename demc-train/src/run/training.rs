@@ -1,6 +1,5 @@
 //! The training loop.
 
-use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::{Context, bail, ensure};
@@ -316,25 +315,15 @@ impl TrainingRun {
         }
         let relmse = found.report.mean.denoised.relmse;
         if self.state.best.is_none_or(|best| relmse < best.relmse) {
-            bundle.save(&self.best_path(), Names::Burn, Precision::F32)?;
+            bundle.save(&self.dir.path().join(BEST), Names::Burn, Precision::F32)?;
             self.state.best = Some(BestValidation { step, relmse });
         }
         Ok(Some(found))
     }
 
-    fn best_path(&self) -> PathBuf {
-        self.dir.path().join(BEST)
-    }
-
     /// One sentence on which weights the run keeps, and why.
     pub fn kept_weights(&self) -> String {
-        let steps = self.config.train.steps;
-        match self.state.best {
-            Some(BestValidation { step, relmse }) => format!(
-                "kept weights: those of step {step} of {steps}, with the best validation RelMSE {relmse:.4}"
-            ),
-            None => format!("kept weights: those of the last step {steps}, no scene is held out"),
-        }
+        self.state.kept_weights(self.config.train.steps)
     }
 
     fn metrics_line(&self, lr: f64, validation: Option<&Validation>) -> MetricsLine {
@@ -391,7 +380,7 @@ impl TrainingRun {
             return Ok(None);
         }
         let bundle = match self.state.best {
-            Some(_) => Bundle::load(&self.best_path(), device)?,
+            Some(_) => Bundle::load(&self.dir.path().join(BEST), device)?,
             None => self.bundle(self.trainer.result()),
         };
         let Validation {

@@ -92,6 +92,16 @@ impl LoopState {
             elapsed_s: 0.0,
         }
     }
+
+    /// One sentence on which weights a run of `steps` steps keeps, and why.
+    pub fn kept_weights(&self, steps: u64) -> String {
+        match self.best {
+            Some(BestValidation { step, relmse }) => format!(
+                "kept weights: those of step {step} of {steps}, with the best validation RelMSE {relmse:.4}"
+            ),
+            None => format!("kept weights: those of the last step {steps}, no scene is held out"),
+        }
+    }
 }
 
 /// A checkpoint in memory.
