@@ -3,7 +3,7 @@ import json
 import random
 import shutil
 
-from common import LONG, Attack
+from common import LONG, REPOSITORY, Attack
 
 CLOCK = ("patches_per_s", "elapsed_s")
 
@@ -62,6 +62,24 @@ class Records(Attack):
                     self.assertEqual(path.read_bytes(), whole)
             shutil.rmtree(self.root / "run" / "checkpoints")
             (self.root / "run" / "latest").unlink()
+
+    def test_06_a_damaged_layout_or_latest(self):
+        shutil.copy(REPOSITORY / "configs" / "renderers" / "demc-exr.toml", self.root / "mine.toml")
+        options = ["--run-dir", "r", "--set", "data.layout=mine.toml"]
+        result = self.run_program("demc-train", "--config", "tiny.toml", *options)
+        self.assertEqual(result.code, 0, result)
+        rng = random.Random(7)
+        for name, words in (("layout.toml", "layout.toml was damaged: restored from"), ("latest", "latest: ")):
+            path = self.root / "r" / name
+            whole = path.read_bytes()
+            for harm in ("empty", "cut short", "zeros", "not UTF-8"):
+                for command in (["--config", "tiny.toml", *options], ["--config", "r/config.toml"]):
+                    path.write_bytes(harms(rng, whole)[harm])
+                    result = self.run_program("demc-train", *command, "--resume")
+                    with self.subTest(name=name, harm=harm, command=command[1]):
+                        self.assertEqual(result.code, 0, result)
+                        self.assertIn(words, result.stdout)
+                    path.write_bytes(whole)
 
     def test_06_a_damaged_configuration_names_its_copy(self):
         (self.root / "run" / "config.toml").write_text("[model\n")
