@@ -133,6 +133,18 @@ impl DataConfig {
             }
         };
         require(
+            !self.root.as_os_str().is_empty(),
+            "root",
+            &self.root,
+            "the directory of a data set",
+        );
+        require(
+            !self.layout.is_empty(),
+            "layout",
+            &self.layout,
+            "a preset or a TOML file",
+        );
+        require(
             (PATCH_MULTIPLE..=MAX_PATCH_SIZE).contains(&self.patch_size)
                 && self.patch_size.is_multiple_of(PATCH_MULTIPLE),
             "patch_size",

@@ -1,8 +1,10 @@
 //! A data set on disk: its `manifest.json`, its scenes and its splits. Scenes are split by *base
 //! scene*: views of one room are never in both splits.
 
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::fmt;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use rand::seq::SliceRandom;
@@ -104,6 +106,7 @@ impl Dataset {
         if layout.reference.is_none() {
             problems.push("the layout names no reference, which training needs".to_owned());
         }
+        problems.extend(repeated_files(&scenes));
         problems.extend(file_problems(&scenes, layout));
         match problems.is_empty() {
             true => Ok(Self {
@@ -216,6 +219,47 @@ fn manifest_problems(scenes: &[Scene]) -> Vec<String> {
     let leaks = split_of.iter().filter(|(_, splits)| splits.len() > 1);
     problems.extend(leaks.map(|(base, _)| format!("base scene {base} is in train and in test")));
     problems
+}
+
+/// Files that several scenes share, under any name. Otherwise training could see a test image.
+fn repeated_files(scenes: &[Scene]) -> Vec<String> {
+    let mut first: BTreeMap<FileId, &Scene> = BTreeMap::new();
+    let mut problems = Vec::new();
+    for scene in scenes {
+        // Missing files are another problem.
+        let Ok(id) = file_id(&scene.path) else {
+            continue;
+        };
+        match first.entry(id) {
+            Entry::Vacant(entry) => {
+                entry.insert(scene);
+            }
+            Entry::Occupied(other) => problems.push(format!(
+                "scenes {} and {} are the same file; remove one",
+                other.get().name,
+                scene.name
+            )),
+        }
+    }
+    problems
+}
+
+/// Device and inode: equal for hard links, too.
+#[cfg(unix)]
+type FileId = (u64, u64);
+#[cfg(not(unix))]
+type FileId = PathBuf;
+
+#[cfg(unix)]
+fn file_id(path: &Path) -> io::Result<FileId> {
+    use std::os::unix::fs::MetadataExt;
+    let found = std::fs::metadata(path)?;
+    Ok((found.dev(), found.ino()))
+}
+
+#[cfg(not(unix))]
+fn file_id(path: &Path) -> io::Result<FileId> {
+    std::fs::canonicalize(path)
 }
 
 /// Problems with the scenes' files. If several files lack the same channels, that is one problem,

@@ -87,6 +87,25 @@ impl Plane {
         out
     }
 
+    /// The value of all samples, if they are equal; `None` for an empty plane.
+    pub fn constant(&self) -> Option<f32> {
+        match self {
+            Plane::Half(samples) => all_equal(samples).map(f16::to_f32),
+            Plane::Float(samples) => all_equal(samples),
+            Plane::Uint(samples) => all_equal(samples).map(|sample| sample as f32),
+        }
+    }
+
+    /// The largest sample; minus infinity for an empty plane.
+    pub fn max(&self) -> f32 {
+        let least = f32::NEG_INFINITY;
+        match self {
+            Plane::Half(samples) => samples.iter().map(|x| x.to_f32()).fold(least, f32::max),
+            Plane::Float(samples) => samples.iter().copied().fold(least, f32::max),
+            Plane::Uint(samples) => samples.iter().max().map_or(least, |x| *x as f32),
+        }
+    }
+
     /// The first NaN or infinite sample (index and value) and the number of such samples, or
     /// `None`.
     pub fn non_finite(&self) -> Option<(usize, f32, usize)> {
@@ -180,6 +199,11 @@ fn clamp<T: PartialOrd + Copy>(samples: &mut [T], zero: T) -> usize {
         clamped += 1;
     }
     clamped
+}
+
+fn all_equal<T: Copy + PartialEq>(samples: &[T]) -> Option<T> {
+    let first = *samples.first()?;
+    samples.iter().all(|x| *x == first).then_some(first)
 }
 
 #[cfg(test)]

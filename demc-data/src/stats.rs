@@ -2,6 +2,7 @@
 //! scenes. Sums are computed per scene in double precision and merged in the order of the scenes,
 //! so the result does not depend on the number of threads.
 
+use crate::content::suspicious;
 use crate::dataset::size_mismatch;
 use crate::frame::{FEATURES, FramePlanes, Presence, TEXTURES};
 use crate::moments::{ChannelMoments, hit_samples};
@@ -27,6 +28,8 @@ pub struct Statistics {
     pub misses: u64,
     /// Number of negative samples of colour and reference that were set to 0.
     pub clamped: u64,
+    /// Phrases of [`crate::content::suspicious`] by scene, in their order.
+    pub suspicious: Vec<(String, Vec<String>)>,
 }
 
 impl Statistics {
@@ -68,8 +71,11 @@ impl Statistics {
         let scene_sums = |scene| SceneSums::of(scene, layout, config, relmse_epsilon);
         let mut total = SceneSums::default();
         let mut summaries = Vec::with_capacity(scenes.len());
-        for sums in parallel::map(threads, scenes.iter().collect(), scene_sums) {
-            let sums = sums?;
+        let mut found = Vec::new();
+        let all = parallel::map(threads, scenes.iter().collect(), scene_sums);
+        for (scene, sums) in scenes.iter().zip(all) {
+            let mut sums = sums?;
+            found.push((scene.name.clone(), std::mem::take(&mut sums.suspicious)));
             total.add(&sums);
             summaries.extend(sums.summary);
         }
@@ -93,6 +99,7 @@ impl Statistics {
             pixels: total.pixels,
             misses: total.misses,
             clamped: total.clamped,
+            suspicious: found,
         })
     }
 }
@@ -106,6 +113,8 @@ struct SceneSums {
     pixels: u64,
     misses: u64,
     clamped: u64,
+    /// Of a single scene; empty in a total.
+    suspicious: Vec<String>,
 }
 
 impl SceneSums {
@@ -120,6 +129,7 @@ impl SceneSums {
         if let Some(error) = size_mismatch(scene, planes.width, planes.height) {
             return Err(error);
         }
+        let found = suspicious(&planes, layout);
         let scale = config.preparation().apply(&mut planes);
         let albedo_epsilon = config.albedo_demodulation_epsilon;
         let pixels = planes.width * planes.height;
@@ -129,6 +139,7 @@ impl SceneSums {
             pixels: pixels as u64,
             misses: misses.count() as u64,
             clamped: planes.clamped as u64,
+            suspicious: found,
             ..Self::default()
         };
         for (channel, plane) in planes.features.iter().enumerate() {

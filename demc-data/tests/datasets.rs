@@ -12,12 +12,16 @@ use serde_json::{Value, json};
 use support::{half, layout, sample, scene_channels, write};
 
 fn entry(name: &str, split: &str, base: &str) -> Value {
-    json!({ "name": name, "split": split, "base": base, "file": "a.exr", "width": 8, "height": 6 })
+    let file = format!("{name}.exr");
+    json!({ "name": name, "split": split, "base": base, "file": file, "width": 8, "height": 6 })
 }
 
-/// A data set whose scenes share one 8x6 file, `a.exr`.
+/// A data set of 8x6 scenes. `gone.exr` is missing.
 fn dataset(root: &Path, scenes: Vec<Value>) -> Result<Dataset, Error> {
-    write(&root.join("a.exr"), (8, 6), scene_channels(8, 6));
+    let files = scenes.iter().filter_map(|scene| scene["file"].as_str());
+    for file in files.filter(|file| *file != "gone.exr") {
+        write(&root.join(file), (8, 6), scene_channels(8, 6));
+    }
     let manifest = json!({ "format": "demc-exr 1", "scenes": scenes, "renderer": "kept" });
     fs::write(root.join("manifest.json"), manifest.to_string()).expect("writable");
     Dataset::open(root, &layout())
@@ -150,6 +154,17 @@ fn every_problem_of_a_manifest_is_named_at_once() {
         assert!(message.contains(part), "{part:?} is not in: {message}");
     }
     assert!(refusal(vec![]).contains("lists no scenes"));
+}
+
+#[test]
+fn one_file_under_two_names_is_refused() {
+    let mut other = entry("b", "test", "b");
+    other["file"] = "./a.exr".into();
+    let message = refusal(vec![entry("a", "train", "a"), other]);
+    assert!(
+        message.ends_with("scenes a and b are the same file; remove one"),
+        "{message}"
+    );
 }
 
 #[test]

@@ -8,11 +8,13 @@
 //!   [`step::optimizer`] updates the weights.
 //! - [`record`] writes metrics, TensorBoard events and the progress bar.
 //! - [`tools`] compares variants, finds learning rates and draws charts.
+//! - [`usage`] has the error of a wrong command line.
 
 pub mod config;
 pub mod record;
 pub mod run;
 pub mod step;
 pub mod tools;
+pub mod usage;
 
 pub use config::Config;

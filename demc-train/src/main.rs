@@ -9,6 +9,7 @@ use demc_infer::compute::IsaError;
 use demc_infer::device::DeviceError;
 use demc_model::ops::within_pool;
 use demc_train::config::ConfigError;
+use demc_train::usage::UsageError;
 
 #[global_allocator]
 static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
@@ -19,8 +20,10 @@ fn main() -> ExitCode {
         Ok(code) => code,
         Err(error) => {
             eprintln!("error: {error:#}");
-            let usage =
-                error.is::<ConfigError>() || error.is::<DeviceError>() || error.is::<IsaError>();
+            let usage = error.is::<ConfigError>()
+                || error.is::<DeviceError>()
+                || error.is::<IsaError>()
+                || error.is::<UsageError>();
             ExitCode::from(if usage { 2 } else { 1 })
         }
     }

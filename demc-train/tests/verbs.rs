@@ -182,7 +182,7 @@ fn a_sweep_suggests_a_rate_and_writes_table_and_chart() {
 
     let error = error_line(
         &run(&[&args[..], &["--from", "1", "--to", "0.1"]].concat()),
-        1,
+        2,
     );
     assert!(error.contains("expected positive, rising rates"), "{error}");
 }

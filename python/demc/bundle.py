@@ -8,6 +8,7 @@ prefix.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from dataclasses import dataclass
@@ -31,6 +32,10 @@ FILTER = "albedo_filter"
 """Key of the albedo filter's entry in the header."""
 PREFIX = f"{FILTER}."
 """Prefix of its tensors."""
+DTYPES = {torch.float32: "F32", torch.float16: "F16"}
+"""Types of tensors and their names in a checksum."""
+CHECKSUM = "sha256"
+"""The header's key with the checksum of header and tensors."""
 TORCH_FROM_BURN = {"gamma": "weight", "beta": "bias"}
 """Last part of a batch-normalisation key: Burn's name to PyTorch's."""
 
@@ -44,7 +49,7 @@ class Bundle:
     feature_mean: Tensor  # [12]
     feature_std: Tensor  # [12]
     step: int
-    meta: dict  # the whole header
+    meta: dict  # the whole header, without the checksum: who saves other weights needs none
     demodulate: float = 0.0  # epsilon of albedo demodulation; 0: off
     albedo_filter: Bundle | None = None  # denoises the albedo (first hit) before the network sees it
 
@@ -130,12 +135,13 @@ def load(path: str | os.PathLike) -> Bundle:
     """Reads a bundle with Burn's or PyTorch's tensor names, in f32 or f16; f16 becomes f32.
 
     Raises OSError if the file cannot be read. Raises ValueError if it is not a bundle of this
-    format, or if its tensors do not match the network in its header.
+    format, if its tensors do not match the network in its header, or if the content differs from
+    the checksum in the header. A file without a checksum loads.
     """
     try:
         with safe_open(path, framework="pt") as file:
             header = (file.metadata() or {}).get("demc")
-            weights = {torch_name_from(name): file.get_tensor(name).float() for name in file.keys()}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
     except SafetensorError as error:
         raise ValueError(f"{path}: truncated, damaged, or not a safetensors file: {error}") from error
     if header is None:
@@ -145,6 +151,10 @@ def load(path: str | os.PathLike) -> Bundle:
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}: header entry 'demc': not JSON: {error}") from error
 
+    found = meta.pop(CHECKSUM, None) if isinstance(meta, dict) else None
+    if found is not None and found != checksum(header.replace(found, "", 1), tensors):
+        raise ValueError(f"{path}: damaged: its checksum differs; edited weights need demc-infer import")
+    weights = {torch_name_from(name): tensor.float() for name, tensor in tensors.items()}
     if not isinstance(meta, dict) or FILTER not in meta:
         return _network(path, meta, weights)
     ours = {name: weight for name, weight in weights.items() if not name.startswith(PREFIX)}
@@ -187,6 +197,15 @@ def _network(path: str | os.PathLike, meta: Any, weights: dict[str, Tensor], *pa
         meta=meta,
         demodulate=demodulate,
     )
+
+
+def checksum(header: str, tensors: dict[str, Tensor]) -> str:
+    """The SHA-256 of a header entry with an empty checksum, and of tensors in the order of their names."""
+    digest = hashlib.sha256(header.encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {DTYPES.get(tensor.dtype)} {list(tensor.shape)}\n".encode())
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def torch_name_from(name: str) -> str:

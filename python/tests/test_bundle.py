@@ -39,6 +39,17 @@ class Headers(unittest.TestCase):
         self.write()
         self.assertEqual(demc.load(self.path).step, 7)
 
+    def test_a_checksum_is_compared_and_left_out_of_the_header(self) -> None:
+        blank = json.dumps(self.meta | {"sha256": ""})
+        self.meta["sha256"] = demc.bundle.checksum(blank, self.weights)
+        self.write()
+        self.assertNotIn("sha256", demc.load(self.path).meta)
+        name = next(iter(self.weights))
+        self.weights[name] = self.weights[name] + 1
+        self.write()
+        with self.assertRaisesRegex(ValueError, "damaged: its checksum differs"):
+            demc.load(self.path)
+
     def with_filter(self) -> None:
         torch.manual_seed(3)
         config = demc.ModelConfig("semc", width=2)

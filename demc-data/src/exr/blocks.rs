@@ -64,6 +64,9 @@ impl<R: Read + Seek> BlockReader<R> {
     pub(super) fn open(mut reader: R) -> Result<Self, ExrError> {
         let length = reader.seek(SeekFrom::End(0))?;
         reader.rewind()?;
+        if length == 0 {
+            return Err(invalid("it is empty".to_owned()));
+        }
         let meta = ::exr::block::read(&mut reader, false)?.into_meta_data();
         meta.headers.iter().try_for_each(check_size)?;
         let tables = reader.stream_position()?;

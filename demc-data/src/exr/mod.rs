@@ -73,6 +73,10 @@ fn reading_error(path: &Path, error: ExrError) -> Error {
             path: path.to_owned(),
             source,
         },
+        // The crate's words for an end of the file between two fields.
+        ExrError::Invalid(detail) if detail == "reference to missing bytes" => {
+            undecodable(path, "it is cut short".to_owned())
+        }
         ExrError::Invalid(detail) => undecodable(path, detail.into_owned()),
         ExrError::NotSupported(detail) => undecodable(path, format!("{detail} ({SUPPORTED})")),
         ExrError::Aborted => undecodable(path, "reading was aborted".to_owned()),

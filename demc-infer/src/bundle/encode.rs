@@ -8,6 +8,7 @@ use half::slice::HalfFloatSliceExt;
 use safetensors::tensor::Dtype;
 use serde::{Deserialize, Serialize};
 
+use super::checksum::{SummedTensor, of_bundle};
 use super::tensors::{EncodedTensor, f32_bytes, serialize};
 use super::{Bundle, BundleError, BundleMeta, PREFIX};
 
@@ -101,12 +102,19 @@ impl<'a> Description<'a> {
     }
 }
 
-/// The header entry: the description and the naming scheme.
+/// The header entry: the description, the naming scheme and the checksum.
 #[derive(Serialize)]
 struct Header<'a> {
     #[serde(flatten)]
     description: Description<'a>,
     names: Names,
+    sha256: &'a str,
+}
+
+impl Header<'_> {
+    fn to_json(&self) -> Result<String, BundleError> {
+        serde_json::to_string(self).map_err(|error| BundleError::Encode(error.to_string()))
+    }
 }
 
 /// The bytes of a bundle file. safetensors sorts tensors by type and name, so equal inputs give
@@ -119,9 +127,6 @@ pub(super) fn encode(
     names: Names,
     precision: Precision,
 ) -> Result<Vec<u8>, BundleError> {
-    let description = Description::of(bundle);
-    let header = serde_json::to_string(&Header { description, names });
-    let header = header.map_err(|error| BundleError::Encode(error.to_string()))?;
     let mut tensors = Vec::new();
     for (network, prefix) in bundle.networks().zip(["", PREFIX]) {
         let specs = network.meta.model.weight_specs();
@@ -140,7 +145,17 @@ pub(super) fn encode(
             });
         }
     }
-    let metadata = HashMap::from([(KEY.to_string(), header)]);
+    let mut header = Header {
+        description: Description::of(bundle),
+        names,
+        sha256: "",
+    };
+    let summed = tensors
+        .iter()
+        .map(|tensor| SummedTensor::new(&tensor.name, tensor.dtype, &tensor.shape, &tensor.bytes));
+    let sum = of_bundle(&header.to_json()?, summed.collect());
+    header.sha256 = &sum;
+    let metadata = HashMap::from([(KEY.to_string(), header.to_json()?)]);
     serialize(&tensors, Some(metadata)).map_err(BundleError::Encode)
 }
 

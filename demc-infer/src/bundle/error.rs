@@ -29,6 +29,15 @@ pub enum BundleError {
     /// Not a safetensors file, or one cut short.
     #[error("{}: cut short, damaged or no safetensors file: {detail}", path.display())]
     Damaged { path: PathBuf, detail: String },
+    /// The content differs from the checksum in the header.
+    #[error(
+        "{}: damaged: its checksum differs; copy or export it again, or, if you edited it, run demc-infer import",
+        path.display()
+    )]
+    Checksum { path: PathBuf },
+    /// A checkpoint's list of checksums that cannot be used.
+    #[error("{}: {detail}", path.display())]
+    Sums { path: PathBuf, detail: String },
     /// A safetensors file from another program.
     #[error(
         "{}: a safetensors file, but no DEMC bundle: its header has no `demc` entry with statistics and layout",

@@ -1,5 +1,6 @@
 //! Reads a bundle file: header and tensors, without building the network.
 
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
@@ -10,16 +11,23 @@ use demc_model::{Head, Weight};
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, Metadata};
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 
 use super::encode::KEY;
 use super::filter::FILTER_KEY;
 use super::tensors::{one_line, values};
-use super::{BundleError, BundleMeta, FORMAT, Names, PREFIX, Precision, locate};
+use super::{BundleError, BundleMeta, FORMAT, Names, PREFIX, Precision, checksum, locate};
 
 /// Longest accepted header in bytes (ours: the widest network's has 20 kB).
 const MAX_HEADER: u64 = 4 << 20;
 /// Size of the field before the header that holds its length, in bytes.
 const LENGTH: usize = 8;
+
+/// The keys of [`BundleMeta`].
+const META_KEYS: [&str; 6] = ["format", "model", "normalizer", "layout", "step", "ranges"];
+
+/// The keys beside them in a header entry.
+const HEADER_KEYS: [&str; 3] = ["names", "sha256", FILTER_KEY];
 
 /// The contents of a bundle file, validated as far as possible without building the network.
 #[derive(Debug, Clone)]
@@ -45,10 +53,15 @@ impl BundleFile {
     /// - The file cannot be read, is cut short, is no bundle, or has another format.
     /// - A tensor has a type other than f32 and f16, or holds NaN or infinity.
     /// - A standard deviation is zero, or another entry of the header is invalid.
+    /// - The content differs from the checksum in the header or, for a directory, in the
+    ///   checkpoint's `SHA256SUMS`.
     pub fn read(path: &Path) -> Result<Self, BundleError> {
-        let path = locate::locate(path)?;
-        let bytes = read(&path)?;
-        Self::parse(path, &bytes)
+        let file = locate::locate(path)?;
+        let bytes = read(&file)?;
+        if file != path {
+            checksum::check_in_checkpoint(&file, &bytes)?;
+        }
+        Self::parse(file, &bytes)
     }
 
     /// Parses the bytes of a bundle file. Errors call it `path`.
@@ -59,6 +72,9 @@ impl BundleFile {
         let header = parse_meta(&path, bytes)?;
         let names = header.names;
         let tensors = SafeTensors::deserialize(bytes).map_err(|error| damaged(&path, &error))?;
+        if let Some(sum) = &header.sha256 {
+            checksum::check(&path, &header.entry, sum, &tensors)?;
+        }
         let mut precision = Precision::F32;
         let mut weights = Vec::with_capacity(tensors.len());
         let mut filter_weights = Vec::new();
@@ -152,18 +168,22 @@ pub(super) fn damaged(path: &Path, error: &safetensors::SafeTensorError) -> Bund
 }
 
 /// The parsed header entry of a bundle file.
-pub(super) struct Header {
+pub(super) struct BundleHeader {
     pub meta: BundleMeta,
     pub names: Names,
     /// Metadata of the albedo filter.
     pub albedo_filter: Option<BundleMeta>,
+    /// The checksum, if the file has one.
+    pub sha256: Option<String>,
+    /// The entry as it stands in the file.
+    pub entry: String,
 }
 
 /// The metadata of a bundle file.
 ///
 /// # Errors
 /// The bytes are no safetensors file, or no bundle.
-pub(super) fn parse_meta(path: &Path, bytes: &[u8]) -> Result<Header, BundleError> {
+pub(super) fn parse_meta(path: &Path, bytes: &[u8]) -> Result<BundleHeader, BundleError> {
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|error| damaged(path, &error))?;
     let entry = header.metadata().as_ref().and_then(|all| all.get(KEY));
     let entry = entry.ok_or_else(|| BundleError::Foreign { path: path.into() })?;
@@ -171,49 +191,50 @@ pub(super) fn parse_meta(path: &Path, bytes: &[u8]) -> Result<Header, BundleErro
 }
 
 /// Parses the header entry, with the entry of an albedo filter in it.
-fn parse_header(entry: &str, path: &Path) -> Result<Header, BundleError> {
+fn parse_header(entry: &str, path: &Path) -> Result<BundleHeader, BundleError> {
     #[derive(Deserialize)]
     struct Rest {
         names: Names,
+        sha256: Option<String>,
         albedo_filter: Option<serde_json::Value>,
     }
     let invalid = |detail: String| BundleError::Header {
         path: path.into(),
         detail: one_line(&detail),
     };
-    let meta = parse_network(entry, path, &invalid)?;
+    let meta = parse_network(entry, path, &HEADER_KEYS, &invalid)?;
     let rest = serde_json::from_str(entry).map_err(|error| invalid(error.to_string()))?;
     let Rest {
         names,
+        sha256,
         albedo_filter,
     } = rest;
-    let Some(entry) = albedo_filter else {
-        return Ok(Header {
-            meta,
-            names,
-            albedo_filter: None,
-        });
-    };
     let within = |detail: String| invalid(format!("{FILTER_KEY}: {detail}"));
-    if entry.get(FILTER_KEY).is_some() {
-        return Err(within("has a filter of its own".into()));
-    }
-    let filter = parse_network(&entry.to_string(), path, &within)?;
-    match filter.filter_problem(meta.normalizer.position) {
-        Some(problem) => Err(within(problem)),
-        None => Ok(Header {
-            meta,
-            names,
-            albedo_filter: Some(filter),
-        }),
-    }
+    let filter = albedo_filter.map(|entry| {
+        if entry.get(FILTER_KEY).is_some() {
+            return Err(within("has a filter of its own".into()));
+        }
+        let filter = parse_network(&entry.to_string(), path, &[], &within)?;
+        match filter.filter_problem(meta.normalizer.position) {
+            Some(problem) => Err(within(problem)),
+            None => Ok(filter),
+        }
+    });
+    Ok(BundleHeader {
+        albedo_filter: filter.transpose()?,
+        meta,
+        names,
+        sha256,
+        entry: entry.to_owned(),
+    })
 }
 
-/// Parses the metadata of one network. The format is checked first, because another format may have
-/// other keys.
+/// Parses the metadata of one network, beside which the entry may have `other_keys`. The format is
+/// checked first, because another format may have other keys.
 fn parse_network(
     entry: &str,
     path: &Path,
+    other_keys: &[&str],
     invalid: &dyn Fn(String) -> BundleError,
 ) -> Result<BundleMeta, BundleError> {
     #[derive(Deserialize)]
@@ -230,6 +251,11 @@ fn parse_network(
     }
     let meta: BundleMeta = serde_json::from_str(entry).map_err(json)?;
     let mut problems = meta.model.validate();
+    // An unknown key could be a damaged `sha256`.
+    let keys: BTreeMap<String, IgnoredAny> = serde_json::from_str(entry).map_err(json)?;
+    let known = |key: &str| META_KEYS.contains(&key) || other_keys.contains(&key);
+    let unknown = keys.keys().filter(|key| !known(key));
+    problems.extend(unknown.map(|key| format!("unknown key `{key}`")));
     problems.extend(statistics_problems(&meta));
     let layout = meta.layout.validate().into_iter();
     problems.extend(layout.map(|problem| format!("layout: {problem}")));

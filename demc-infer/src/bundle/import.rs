@@ -90,7 +90,8 @@ impl BundleFile {
     /// names.
     ///
     /// `like` describes the network. Without it, the file's own header must. A file without the
-    /// tensors of an albedo filter gets the filter of `like`.
+    /// tensors of an albedo filter gets the filter of `like`. The checksum in the header is not
+    /// compared, because imported weights were usually changed on purpose.
     ///
     /// # Errors
     /// - The file cannot be read or is no safetensors file.

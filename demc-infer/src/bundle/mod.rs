@@ -3,7 +3,7 @@
 //!
 //! The weights are tensors by name ([`Names`]: Burn's or PyTorch's) in f32 or f16 ([`Precision`];
 //! batch normalisation stays f32). The header's metadata has one key, `demc`: [`BundleMeta`] as
-//! JSON, with the key `names` added. A single key keeps the bytes reproducible, because the
+//! JSON, with the keys `names` and `sha256` added ([`checksum`]). A single key keeps the bytes reproducible, because the
 //! `safetensors` crate writes metadata in random order.
 //!
 //! Statistics are stored with the weights because every output value depends on them. Weights
@@ -13,6 +13,7 @@
 //! A bundle may contain a second network, the albedo filter. Its tensors have the prefix
 //! `albedo_filter.`, and the header entry has its [`BundleMeta`] as `albedo_filter`.
 
+pub mod checksum;
 mod encode;
 mod error;
 mod file;

@@ -6,7 +6,7 @@ use std::fs;
 use demc_model::Variant;
 use safetensors::tensor::{Dtype, TensorView};
 
-use super::testing::bundle;
+use super::testing::{bundle, without_checksum};
 use super::*;
 
 const STYLES: [(Names, Precision); 4] = [
@@ -63,7 +63,7 @@ fn good() -> (TensorList, String) {
             view.data().to_vec(),
         )
     });
-    (tensors.collect(), entry)
+    (tensors.collect(), without_checksum(&entry))
 }
 
 #[test]
@@ -145,6 +145,25 @@ fn statistics_that_divide_by_zero_are_refused() {
         error.contains("normalizer.features: normal.x: mean 0, std 0"),
         "{error}"
     );
+}
+
+#[test]
+fn a_file_that_differs_from_its_checksum_is_refused() {
+    let bytes = encoded(&bundle(Variant::Demc), Names::Torch, Precision::F16);
+    let mut damaged = bytes.clone();
+    let last = damaged.len() - 1;
+    damaged[last] ^= 1;
+    assert!(error_of(&damaged).starts_with("damaged: its checksum differs"));
+    let text = String::from_utf8_lossy(&bytes[8..]).into_owned();
+    let place = 8 + text.find("sha256").expect("a checksum");
+    let mut renamed = bytes.clone();
+    renamed[place] ^= 1;
+    assert_eq!(
+        error_of(&renamed),
+        "header entry `demc`: unknown key `rha256`"
+    );
+    let path = Path::new("memory");
+    assert!(BundleFile::parse(path.into(), &bytes).is_ok());
 }
 
 #[test]

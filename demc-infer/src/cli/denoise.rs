@@ -14,7 +14,7 @@ use demc_infer::guard::{EnergyBias, Warning};
 use demc_infer::{Bundle, Picture, memory};
 
 use super::Clamped;
-use super::exposure::{InputScaleFlag, SequenceScales};
+use super::exposure::{InputScaleFlag, SequenceScales, stops};
 use super::flags::{DeviceFlag, EnsembleFlag, ModelFlag, TilingFlags, describe};
 use super::inputs::{Frames, Inputs};
 use super::jobs::{Job, Jobs};
@@ -86,7 +86,8 @@ pub struct Arguments {
         value_name = "STOPS",
         default_value_t = 0.0,
         requires = "png",
-        allow_hyphen_values = true
+        allow_hyphen_values = true,
+        value_parser = stops
     )]
     exposure: f32,
     #[command(flatten)]

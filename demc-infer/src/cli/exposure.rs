@@ -26,6 +26,17 @@ pub struct InputScaleFlag {
     pub choice: InputScale,
 }
 
+/// Largest exposure of a preview in stops, in both directions: all of f32's range.
+const MAX_STOPS: f32 = 128.0;
+
+/// Parses the exposure of a preview.
+pub fn stops(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(stops) if stops.abs() <= MAX_STOPS => Ok(stops),
+        _ => Err(format!("expected stops from -{MAX_STOPS} to {MAX_STOPS}")),
+    }
+}
+
 /// The value of `--input-scale`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum InputScale {

@@ -8,8 +8,14 @@ use demc_train::config::Config;
 use demc_train::record::progress::{StepProgress, say};
 use demc_train::run::data::RunData;
 use demc_train::tools::find_lr::{RateRange, sweep};
+use demc_train::usage::UsageError;
 
 use super::compute::ComputeArguments;
+
+/// Fewest steps of a sweep: the first ten ratios are 1.
+const MIN_STEPS: usize = 10;
+/// More steps are a mistake.
+const MAX_STEPS: usize = 1_000_000;
 
 /// Find a learning rate: train with a rising rate until the loss diverges
 ///
@@ -50,13 +56,28 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let Arguments {
         from, to, steps, ..
     } = arguments;
-    anyhow::ensure!(
-        from > 0.0 && from < to && to.is_finite() && steps >= 10,
-        "--from {from} --to {to} --steps {steps}: expected positive, rising rates and at least 10 steps"
-    );
+    let is_range = from > 0.0 && from < to && to.is_finite();
+    if !is_range || !(MIN_STEPS..=MAX_STEPS).contains(&steps) {
+        return Err(UsageError(format!(
+            "--from {from} --to {to} --steps {steps}: expected positive, rising rates and {MIN_STEPS} to {MAX_STEPS} steps"
+        ))
+        .into());
+    }
+    if let Some(stem) = &arguments.out
+        && stem.file_name().is_none()
+    {
+        let stem = stem.display();
+        return Err(UsageError(format!(
+            "--out {stem}: expected a file name without extension"
+        ))
+        .into());
+    }
     let config = Config::load(&arguments.config, &arguments.set)?;
     let device = arguments.compute.device()?;
     let data = RunData::open(&config)?;
+    for warning in &data.warnings {
+        say(format!("warning: {warning}"));
+    }
     say(format!(
         "data: {} in {}",
         data.summary(),

@@ -39,7 +39,10 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         linear,
     } = arguments;
     let stem = out.unwrap_or_else(|| runs[0].join("curves"));
-    let path = plot(&runs, &stem, &PlotOptions { smooth, linear })?;
-    say(path.display());
+    let drawn = plot(&runs, &stem, &PlotOptions { smooth, linear })?;
+    for note in drawn.notes {
+        say(format!("note: {note}"));
+    }
+    say(drawn.path.display());
     Ok(ExitCode::SUCCESS)
 }

@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
-use demc_train::config::Config;
+use demc_train::config::{Config, ConfigError};
 use demc_train::record::progress::say;
+use demc_train::run::run_dir::{CONFIG, copy_in_checkpoint};
 use demc_train::run::session::{Session, SessionOptions, SessionOutcome};
 
 use super::compute::{ComputeArguments, stopped};
@@ -46,12 +47,26 @@ fn run_dir_set(dir: &Path) -> String {
     format!("run.dir={dir}")
 }
 
+/// Adds where an intact copy of a run's own configuration is.
+fn with_copy(error: ConfigError, config: &Path) -> ConfigError {
+    let run = config.parent().filter(|_| config.ends_with(CONFIG));
+    let copy = run.and_then(|run| copy_in_checkpoint(run, CONFIG).ok().flatten());
+    match copy {
+        Some(copy) => ConfigError::Source(format!(
+            "{:#}; {} is an intact copy",
+            anyhow::Error::new(error),
+            copy.display()
+        )),
+        None => error,
+    }
+}
+
 /// Trains a run, new or resumed.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let mut sets = arguments.set;
     sets.extend(arguments.run_dir.as_deref().map(run_dir_set));
     let config = arguments.config.expect("clap requires it");
-    let config = Config::load(&config, &sets)?;
+    let config = Config::load(&config, &sets).map_err(|error| with_copy(error, &config))?;
     let device = arguments.compute.device()?;
     let options = SessionOptions {
         resume: arguments.resume,
@@ -62,6 +77,9 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     say(format!("demc-train: {}", session.headline()));
     say(format!("\n{}", session.run().config().to_toml()));
     say(format!("data: {} in {}", session.data, root.display()));
+    for warning in &session.warnings {
+        say(format!("warning: {warning}"));
+    }
     for note in &session.notes {
         say(format!("note: {note}"));
     }
@@ -76,7 +94,12 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         run.config().patches_per_step()
     ));
     if arguments.check {
-        say("check: configuration and data are valid; nothing was written");
+        say(match session.warnings.len() {
+            0 => "check: configuration and data are valid; nothing was written".to_owned(),
+            _ => {
+                "check: training is possible, but see the warnings; nothing was written".to_owned()
+            }
+        });
         return Ok(ExitCode::SUCCESS);
     }
     say(format!("run: {}\n", dir.display()));

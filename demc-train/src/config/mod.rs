@@ -104,6 +104,14 @@ impl Config {
         let printable = |error: String| error.replace(char::is_control, "\u{fffd}");
         let mut config = config.map_err(|error| ConfigError::Source(printable(error)))?;
         let problems = config.validate();
+        let (from_sets, problems) = source::blame(problems, sets);
+        if !from_sets.is_empty() {
+            let mut all = from_sets;
+            if !problems.is_empty() {
+                all.push(format!("{}: {}", path.display(), problems.join("; ")));
+            }
+            return Err(ConfigError::Source(printable(all.join("; "))));
+        }
         if !problems.is_empty() {
             return Err(ConfigError::Values {
                 path: path.into(),

@@ -51,10 +51,16 @@ pub(super) fn parse<T: DeserializeOwned>(
     }
     let mut tables: Table = toml::from_str(text).map_err(|error| located(&error))?;
     for (set, edit) in edits {
-        edit.apply(&mut tables)
-            .map_err(|problem| format!("--set {set}: {problem}"))?;
-        let checked = T::deserialize(tables.clone());
-        checked.map_err(|error| format!("--set {set}: {}", one_line(error.message())))?;
+        let named = |problem: String| format!("--set {set}: {problem}");
+        edit.apply(&mut tables).map_err(named)?;
+        let Err(error) = T::deserialize(tables.clone()) else {
+            continue;
+        };
+        // A bare string may look like a number: `run.dir=2024`.
+        edit.as_text().apply(&mut tables).map_err(named)?;
+        if T::deserialize(tables.clone()).is_err() {
+            return Err(named(edit.refusal(error.message())));
+        }
     }
     T::deserialize(tables).map_err(|error| located(&error))
 }
@@ -134,16 +140,28 @@ fn check_key(path: &str, is_boolean: bool, keys: &BTreeSet<String>) -> Result<()
     }
     match keys.contains(path) {
         true => Ok(()),
+        false if tables(keys).contains(path) => {
+            let prefix = format!("{path}.");
+            let keys: Vec<&String> = keys.iter().filter(|key| key.starts_with(&prefix)).collect();
+            let keys = keys
+                .iter()
+                .map(|key| key.as_str())
+                .collect::<Vec<_>>()
+                .join(", ");
+            Err(format!("`{path}` is a table; set one of its keys: {keys}"))
+        }
         false => Err(format!("unknown key `{path}`{}", suggestion(path, keys))),
     }
 }
 
+fn tables(keys: &BTreeSet<String>) -> BTreeSet<&str> {
+    let tables = keys.iter().filter_map(|key| key.split('.').next());
+    tables.collect()
+}
+
 /// `; did you mean ...?` with the nearest table or key, or the list of those that exist.
 fn suggestion(path: &str, keys: &BTreeSet<String>) -> String {
-    let tables: BTreeSet<&str> = keys
-        .iter()
-        .filter_map(|key| key.split('.').next())
-        .collect();
+    let tables = tables(keys);
     let keys_of = |table| {
         keys.iter()
             .filter_map(move |key| key.strip_prefix(table)?.strip_prefix('.'))
@@ -190,6 +208,8 @@ fn nearest<'a>(name: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a s
 struct Edit<'a> {
     table: &'a str,
     key: &'a str,
+    /// The text after the equals sign; empty to remove the key.
+    text: &'a str,
     /// `None` removes the key.
     value: Option<Value>,
 }
@@ -199,33 +219,80 @@ fn edit<'a>(set: &'a str, keys: &BTreeSet<String>) -> Result<Edit<'a>, String> {
         .split_once('=')
         .ok_or("expected table.key=value, or table.key= to remove the key")?;
     let (path, value) = (path.trim(), value.trim());
-    let parsed = toml::from_str::<Table>(&format!("value = {value}")).ok();
-    let parsed = parsed.and_then(|mut table| table.remove("value"));
-    let value = match value.is_empty() {
+    if set.contains(char::is_control) {
+        return Err("a line break or another control character; give one key and its value".into());
+    }
+    let text = value;
+    let value = match text.is_empty() {
         true => None,
-        false => Some(parsed.unwrap_or_else(|| Value::String(value.into()))),
+        false => Some(text.parse().unwrap_or_else(|_| Value::String(text.into()))),
     };
     check_key(path, matches!(value, Some(Value::Boolean(_))), keys)?;
     let (table, key) = path
         .split_once('.')
         .expect("every known key belongs to a table");
-    Ok(Edit { table, key, value })
+    Ok(Edit {
+        table,
+        key,
+        text,
+        value,
+    })
 }
 
 impl Edit<'_> {
-    fn apply(self, tables: &mut Table) -> Result<(), String> {
+    /// The same edit with its text as a string.
+    fn as_text(&self) -> Self {
+        Edit {
+            value: (!self.text.is_empty()).then(|| Value::String(self.text.into())),
+            ..*self
+        }
+    }
+
+    /// Why the value does not fit its key: what TOML says, or that the text is no number in TOML.
+    fn refusal(&self, message: &str) -> String {
+        let is_number = self.text.parse::<f64>().is_ok_and(|x| !x.is_nan());
+        match &self.value {
+            Some(Value::String(text)) if is_number && text == self.text => format!(
+                "{text} is no number in TOML: integers are at most {}, without leading zeros",
+                i64::MAX
+            ),
+            _ => one_line(message),
+        }
+    }
+
+    fn apply(&self, tables: &mut Table) -> Result<(), String> {
         let table = tables
             .entry(self.table)
             .or_insert_with(|| Value::Table(Table::new()));
         let table = table
             .as_table_mut()
             .ok_or_else(|| format!("`{}` is not a table", self.table))?;
-        match self.value {
-            Some(value) => table.insert(self.key.into(), value),
+        match &self.value {
+            Some(value) => table.insert(self.key.into(), value.clone()),
             None => table.remove(self.key),
         };
         Ok(())
     }
+}
+
+/// Divides problems with values into those of edits, which name the edit, and the others. A problem
+/// begins with `table.key`, or with `table:` if it concerns several keys.
+pub(super) fn blame(problems: Vec<String>, sets: &[String]) -> (Vec<String>, Vec<String>) {
+    let concerns = |problem: &str, set: &str| {
+        let key = set.split('=').next().unwrap_or_default().trim();
+        let (table, _) = key.split_once('.').unwrap_or((key, ""));
+        let rest = problem.strip_prefix(key);
+        rest.is_some_and(|rest| !rest.starts_with(|c: char| c.is_alphanumeric() || c == '_'))
+            || problem.starts_with(&format!("{table}:"))
+    };
+    let (mut from_sets, mut others) = (Vec::new(), Vec::new());
+    for problem in problems {
+        match sets.iter().rev().find(|set| concerns(&problem, set)) {
+            Some(set) => from_sets.push(format!("--set {set}: {problem}")),
+            None => others.push(problem),
+        }
+    }
+    (from_sets, others)
 }
 
 pub(crate) fn one_line(message: &str) -> String {

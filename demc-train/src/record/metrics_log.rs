@@ -5,9 +5,11 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use demc_data::content::listed;
 use demc_data::file::write_whole;
 use demc_model::config::DETAIL_CHANNELS;
-use serde::Serialize;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 
 /// `metrics.jsonl`, open to append.
 #[derive(Debug)]
@@ -15,6 +17,7 @@ pub struct MetricsLog {
     file: File,
     path: PathBuf,
     lost: bool,
+    damaged: Vec<usize>,
 }
 
 /// One line of `metrics.jsonl`.
@@ -80,30 +83,29 @@ impl MetricsLine {
 }
 
 impl MetricsLog {
-    /// The log at `path`, without the lines after `step` and without an incomplete last line.
+    /// The log at `path`, without the lines after `step`, an incomplete last line, and damaged
+    /// lines.
     ///
     /// # Errors
     /// A log that cannot be read or written.
     pub fn open(path: &Path, step: u64) -> anyhow::Result<Self> {
         let lost = step > 0 && !path.exists();
-        let text = if path.exists() {
-            fs::read_to_string(path)
-        } else {
-            Ok(String::new())
+        let bytes = match path.exists() {
+            true => fs::read(path).with_context(|| path.display().to_string())?,
+            false => Vec::new(),
         };
-        let text = text.with_context(|| path.display().to_string())?;
-        let kept: String = text
-            .split_inclusive('\n')
-            .take_while(|line| is_line_until(line, step))
-            .collect();
-        if kept.len() != text.len() {
-            write_whole(path, |file| file.write_all(kept.as_bytes()))?;
+        let StoredLines { lines, damaged } = read_lines::<LineStep>(&bytes);
+        let kept = lines.iter().filter(|(_, line)| line.step <= step);
+        let kept: Vec<u8> = kept.flat_map(|(text, _)| *text).copied().collect();
+        if kept.len() != bytes.len() {
+            write_whole(path, |file| file.write_all(&kept))?;
         }
         let file = OpenOptions::new().create(true).append(true).open(path);
         Ok(MetricsLog {
             file: file.with_context(|| path.display().to_string())?,
             path: path.to_owned(),
             lost,
+            damaged,
         })
     }
 
@@ -115,6 +117,11 @@ impl MetricsLog {
     /// Whether the lines of earlier steps are missing.
     pub fn was_lost(&self) -> bool {
         self.lost
+    }
+
+    /// The numbers of the damaged lines that were removed, from 1.
+    pub fn damaged(&self) -> &[usize] {
+        &self.damaged
     }
 
     /// Appends a line.
@@ -138,13 +145,43 @@ pub fn elapsed(path: &Path) -> Option<f64> {
     line.get("elapsed_s")?.as_f64()
 }
 
-/// Whether `text` is a complete line of a step up to `step`.
-fn is_line_until(text: &str, step: u64) -> bool {
-    let line = text
-        .strip_suffix('\n')
-        .and_then(|line| serde_json::from_str::<serde_json::Value>(line).ok());
-    line.and_then(|line| line.get("step")?.as_u64())
-        .is_some_and(|line_step| line_step <= step)
+/// The key that every line has.
+#[derive(Deserialize)]
+struct LineStep {
+    step: u64,
+}
+
+/// The lines of a log.
+pub struct StoredLines<'a, T> {
+    /// Each intact line with its text, line feed included.
+    pub lines: Vec<(&'a [u8], T)>,
+    /// The numbers of the others, from 1.
+    pub damaged: Vec<usize>,
+}
+
+/// Parses a log. A damaged line costs that line alone. An incomplete last line is what a killed
+/// process leaves, and counts as neither.
+pub fn read_lines<T: DeserializeOwned>(bytes: &[u8]) -> StoredLines<'_, T> {
+    let mut found = StoredLines {
+        lines: Vec::new(),
+        damaged: Vec::new(),
+    };
+    for (index, line) in bytes.split_inclusive(|byte| *byte == b'\n').enumerate() {
+        match serde_json::from_slice(line) {
+            Ok(parsed) if line.ends_with(b"\n") => found.lines.push((line, parsed)),
+            Err(_) if line.ends_with(b"\n") => found.damaged.push(index + 1),
+            _ => {}
+        }
+    }
+    found
+}
+
+/// `damaged lines 3, 7`
+pub fn damaged_lines(numbers: &[usize]) -> String {
+    let plural = if numbers.len() == 1 { "" } else { "s" };
+    let names: Vec<String> = numbers.iter().map(usize::to_string).collect();
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    format!("damaged line{plural} {}", listed(&names))
 }
 
 #[cfg(test)]
@@ -184,6 +221,22 @@ mod tests {
         let cut = fs::read_to_string(&path).unwrap();
         assert_eq!(cut.lines().count(), 2);
         assert!(whole.starts_with(&cut));
+    }
+
+    #[test]
+    fn a_damaged_line_costs_that_line_alone() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("metrics.jsonl");
+        let intact: [&[u8]; 2] = [b"{\"step\":1}\n", b"{\"step\":3}\n"];
+        let damaged: [&[u8]; 4] = [b"\xff\x00\n", b"{\"step\":-2}\n", b"[]\n", b"\n"];
+        for line in damaged {
+            fs::write(&path, [intact[0], line, intact[1]].concat()).unwrap();
+            let log = MetricsLog::open(&path, 3).unwrap();
+            assert_eq!(log.damaged(), [2]);
+            assert_eq!(fs::read(&path).unwrap(), intact.concat());
+        }
+        assert_eq!(damaged_lines(&[2]), "damaged line 2");
+        assert_eq!(damaged_lines(&[2, 5]), "damaged lines 2, 5");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use demc_infer::picture::Picture;
 
 use crate::config::Config;
-use crate::record::metrics_log::{MetricsLine, MetricsLog};
+use crate::record::metrics_log::{MetricsLine, MetricsLog, damaged_lines};
 use crate::record::progress::StepProgress;
 use crate::record::tensorboard::EventFile;
 use crate::run::run_dir::RunDir;
@@ -42,6 +42,13 @@ impl Recorder {
             progress.line(format!(
                 "note: {} was missing: it starts after step {step}",
                 metrics.path().display()
+            ));
+        }
+        if !metrics.damaged().is_empty() {
+            progress.line(format!(
+                "note: {}: {} removed",
+                metrics.path().display(),
+                damaged_lines(metrics.damaged())
             ));
         }
         let per_step = config.patches_per_step();

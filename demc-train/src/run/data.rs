@@ -1,9 +1,15 @@
 //! The data of a run: the scenes of each split, and the statistics of the training scenes.
 
+use std::collections::BTreeMap;
+
 use anyhow::Context;
+use demc_data::checksum::sha256_of;
+use demc_data::content;
+use demc_data::exr::ExrFile;
+use demc_data::frame::{FramePlanes, Presence};
 use demc_data::{
     ChannelLayout, DataConfig, Dataset, Dropout, Normalizer, PatchSource, Ranges, Scene, Split,
-    Statistics, read_frame,
+    Statistics,
 };
 use demc_infer::bundle::BundleMeta;
 use demc_model::ModelConfig;
@@ -27,8 +33,32 @@ pub struct RunData {
     pub ranges: Ranges,
     /// Which buffers training drops, so that files may lack them.
     pub dropout: Dropout,
+    /// SHA-256 of each scene's file, by the scene's name.
+    pub checksums: BTreeMap<String, String>,
+    /// Suspicious signs in the scenes, one line each.
+    pub warnings: Vec<String>,
     /// Number of negative values of colour and reference, which are clamped to 0.
     pub clamped: u64,
+}
+
+fn checksums<'a>(
+    scenes: impl Iterator<Item = &'a Scene>,
+) -> Result<BTreeMap<String, String>, demc_data::Error> {
+    scenes
+        .map(|scene| Ok((scene.name.clone(), sha256_of(&scene.path)?)))
+        .collect()
+}
+
+/// A warning for each group of scenes with equal files.
+fn copies(checksums: &BTreeMap<String, String>) -> Vec<String> {
+    let mut scenes: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for (name, sum) in checksums {
+        scenes.entry(sum).or_default().push(name);
+    }
+    let groups = scenes.values().filter(|names| names.len() > 1);
+    groups
+        .map(|names| format!("copies of one image: {}", content::listed(names)))
+        .collect()
 }
 
 impl RunData {
@@ -61,11 +91,19 @@ impl RunData {
         let statistics =
             Statistics::measure(&train, &layout, &config.data, config.loss.relmse_epsilon)
                 .context("measuring the training scenes")?;
-        let mut clamped = statistics.clamped;
+        let (mut clamped, mut suspicious) = (statistics.clamped, statistics.suspicious);
+        let present = Presence::IfPresent;
         for scene in validation.iter().chain(&test) {
             // Now, not after days of training.
-            clamped += read_frame(&scene.path, &layout)?.clamped as u64;
+            let mut file = ExrFile::open(&scene.path)?;
+            let planes = FramePlanes::decode(&mut file, &layout, present, present)?;
+            clamped += planes.clamped as u64;
+            suspicious.push((scene.name.clone(), content::suspicious(&planes, &layout)));
         }
+        // The files were just read, so the system has them in memory.
+        let checksums = checksums(train.iter().chain(&validation).chain(&test))?;
+        let mut warnings = content::by_problem(&suspicious);
+        warnings.extend(copies(&checksums));
         Ok(RunData {
             layout,
             train,
@@ -77,6 +115,8 @@ impl RunData {
                 false => statistics.ranges,
             },
             dropout: config.data.dropout,
+            checksums,
+            warnings,
             clamped,
         })
     }

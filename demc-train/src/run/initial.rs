@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::{Context, bail, ensure};
 use burn::tensor::Device;
+use demc_data::checksum::sha256_of;
 use demc_data::ranges::Ranges;
 use demc_infer::bundle::{Bundle, BundleFile};
 use demc_model::{Denoiser, ModelConfig};
@@ -12,7 +13,6 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
-use crate::run::checkpoint::store::sha256_of;
 
 /// A network before its first step.
 pub struct InitialNetwork {

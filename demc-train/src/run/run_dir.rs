@@ -3,7 +3,7 @@
 //! ```text
 //! config.toml       the resolved configuration, which repeats the run
 //! layout.toml       the channel layout, if it is not a preset
-//! run.json          versions, device, scenes of each split, statistics, checksum of train.init
+//! run.json          versions, device, scenes and checksums of their files, statistics, train.init
 //! metrics.jsonl     one object per line, see `metrics_log`
 //! tensorboard/      metrics and pictures for TensorBoard
 //! latest, checkpoints/, best.safetensors
@@ -16,21 +16,19 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
+use demc_data::ChannelLayout;
 use demc_data::file::write_whole;
-use demc_data::{ChannelLayout, Normalizer, Scene};
-use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
 use crate::record::metrics_log::MetricsLog;
 use crate::run::checkpoint::store::CheckpointStore;
 use crate::run::data::RunData;
-use crate::run::initial::InitialWeights;
+use crate::run::run_record::{RunFacts, RunRecord};
 
-const CONFIG: &str = "config.toml";
+/// The resolved configuration.
+pub const CONFIG: &str = "config.toml";
 /// The record of versions, device and data.
 const RUN: &str = "run.json";
-/// The manifest that pins the version of Burn; Burn itself exports none.
-const MANIFEST: &str = include_str!("../../../Cargo.toml");
 const METRICS: &str = "metrics.jsonl";
 /// The channel layout, if it is not a preset.
 const LAYOUT: &str = "layout.toml";
@@ -51,84 +49,12 @@ pub struct RunDir {
     lock: Option<File>,
 }
 
-#[derive(Debug, Serialize, Deserialize)]
-struct RunRecord {
-    demc: String,
-    burn: String,
-    /// Device of the first start.
-    device: String,
-    /// Implementation of the operations on the first start.
-    #[serde(default)]
-    operations: String,
-    /// Number of trainable parameters.
-    parameters: u64,
-    patches: usize,
-    /// Names of the scenes of each split.
-    scenes: SceneNames,
-    /// Gamma and the statistics of the training scenes.
-    normalizer: Normalizer,
-    /// Channels of the files.
-    layout: ChannelLayout,
-    /// The weights of `train.init`, if any.
-    #[serde(default)]
-    init: Option<InitialWeights>,
-}
-
-impl RunRecord {
-    fn new(data: &RunData, facts: RunFacts) -> Self {
-        RunRecord {
-            demc: env!("CARGO_PKG_VERSION").to_string(),
-            burn: burn_version(),
-            device: facts.device.to_string(),
-            operations: facts.operations.to_string(),
-            parameters: facts.parameters,
-            patches: facts.patches,
-            scenes: SceneNames::of(data),
-            normalizer: data.normalizer.clone(),
-            layout: data.layout.clone(),
-            init: facts.initial.cloned(),
-        }
-    }
-}
-
-#[derive(Debug, PartialEq, Serialize, Deserialize)]
-struct SceneNames {
-    train: Vec<String>,
-    validation: Vec<String>,
-    test: Vec<String>,
-}
-
-impl SceneNames {
-    fn of(data: &RunData) -> Self {
-        let names = |scenes: &[Scene]| scenes.iter().map(|scene| scene.name.clone()).collect();
-        SceneNames {
-            train: names(&data.train),
-            validation: names(&data.validation),
-            test: names(&data.test),
-        }
-    }
-}
-
-/// What `run.json` records besides the data.
-#[derive(Clone, Copy, Debug)]
-pub struct RunFacts<'a> {
-    /// Name of the device.
-    pub device: &'a str,
-    /// Implementation of the operations.
-    pub operations: &'a str,
-    /// Number of trainable parameters.
-    pub parameters: u64,
-    /// Patches per epoch.
-    pub patches: usize,
-    /// The weights of `train.init`, if the run is new and has any.
-    pub initial: Option<&'a InitialWeights>,
-}
-
 impl RunDir {
     /// The directory of a run, if it is free or contains the same run and `resume` is set. Writes
     /// nothing.
     ///
-    /// If the saved configuration is missing, that of the newest intact checkpoint is used.
+    /// If the saved configuration is missing or damaged, that of the newest intact checkpoint is
+    /// used.
     ///
     /// # Errors
     /// A directory with a run that is not to be resumed, or with another run: each differing key is
@@ -143,15 +69,7 @@ impl RunDir {
         let Some(trace) = trace.into_iter().find(|name| path.join(name).exists()) else {
             return Ok(dir);
         };
-        let saved = match path.join(CONFIG) {
-            saved if saved.exists() => Some(saved),
-            _ => {
-                let checkpoint = CheckpointStore::new(&path).newest_intact()?.intact;
-                checkpoint.map(|dir| dir.join(CONFIG))
-            }
-        };
-        if let Some(saved) = &saved {
-            let saved = Config::load(saved, &[])?;
+        if let Some(saved) = dir.saved_config()? {
             let differences = config.differences(&saved);
             ensure!(
                 differences.is_empty(),
@@ -167,6 +85,28 @@ impl RunDir {
             );
         }
         Ok(dir)
+    }
+
+    /// The configuration of the run in the directory: its own, or that of the newest intact
+    /// checkpoint if it is missing or damaged. `None` without either.
+    fn saved_config(&self) -> anyhow::Result<Option<Config>> {
+        if let Ok(saved) = Config::load(&self.path.join(CONFIG), &[]) {
+            return Ok(Some(saved));
+        }
+        let copy = copy_in_checkpoint(&self.path, CONFIG)?;
+        Ok(copy.map(|copy| Config::load(&copy, &[])).transpose()?)
+    }
+
+    /// Compares the scenes with those of the start of the run, if its record is intact.
+    ///
+    /// # Errors
+    /// Each scene that differs, by name.
+    pub fn check_scenes(&self, data: &RunData) -> anyhow::Result<()> {
+        let path = self.path.join(RUN);
+        match read_record(&path)? {
+            StoredRecord::Intact(record) => record.check_scenes(&path, data),
+            StoredRecord::Missing | StoredRecord::Damaged => Ok(()),
+        }
     }
 
     /// Locks the directory, if it exists, against other training processes.
@@ -200,7 +140,8 @@ impl RunDir {
     }
 
     /// Creates and locks the directory. Writes configuration and record of a new run; compares the
-    /// record of a resumed one. Returns a note if its versions or device changed.
+    /// record of a resumed one. Returns notes: changed versions or device, and damaged files, which
+    /// are written again.
     ///
     /// # Errors
     /// A directory that cannot be written or is in use; other scenes, statistics or layout than at
@@ -210,13 +151,17 @@ impl RunDir {
         config: &Config,
         data: &RunData,
         facts: RunFacts,
-    ) -> anyhow::Result<Option<String>> {
+    ) -> anyhow::Result<Vec<String>> {
         let made = fs::create_dir_all(&self.path);
         made.with_context(|| format!("cannot create {}", self.path.display()))?;
         if self.lock.is_none() {
             self.lock()?;
         }
-        if !self.path.join(CONFIG).exists() {
+        let mut notes = Vec::new();
+        let damaged = |path: &Path| format!("{} was damaged: written again", path.display());
+        let saved = self.path.join(CONFIG);
+        if !fs::read(&saved).is_ok_and(|bytes| is_usable(CONFIG, &bytes)) {
+            notes.extend(saved.exists().then(|| damaged(&saved)));
             let mut saved = config.clone();
             if config.data.layout.ends_with(".toml") {
                 self.write(LAYOUT, toml::to_string(&data.layout)?.as_bytes())?;
@@ -224,36 +169,19 @@ impl RunDir {
             }
             self.write(CONFIG, saved.to_toml().as_bytes())?;
         }
-        let record = self.path.join(RUN);
-        if !record.exists() {
-            let written = RunRecord::new(data, facts);
-            self.write(RUN, &serde_json::to_vec_pretty(&written)?)?;
-            return Ok(None);
-        }
-        let text = fs::read_to_string(&record).with_context(|| record.display().to_string())?;
-        let first: RunRecord =
-            serde_json::from_str(&text).with_context(|| record.display().to_string())?;
+        let path = self.path.join(RUN);
         let now = RunRecord::new(data, facts);
-        for (what, same) in [
-            ("scenes", first.scenes == now.scenes),
-            ("statistics", first.normalizer == now.normalizer),
-            ("channel layout", first.layout == now.layout),
-        ] {
-            ensure!(
-                same,
-                "{}: the run started with different {what}",
-                record.display()
-            );
+        match read_record(&path)? {
+            StoredRecord::Intact(first) => {
+                first.check_data(&path, data)?;
+                notes.extend(first.version_note(&now));
+                return Ok(notes);
+            }
+            StoredRecord::Damaged => notes.push(damaged(&path)),
+            StoredRecord::Missing => {}
         }
-        let versions = |record: &RunRecord| {
-            format!(
-                "demc {}, Burn {}, {}, {}",
-                record.demc, record.burn, record.device, record.operations
-            )
-        };
-        let (then, now) = (versions(&first), versions(&now));
-        Ok((then != now)
-            .then(|| format!("this run started on {then}; on {now} its bits may differ")))
+        self.write(RUN, &serde_json::to_vec_pretty(&now)?)?;
+        Ok(notes)
     }
 
     fn lock(&mut self) -> anyhow::Result<()> {
@@ -288,21 +216,44 @@ impl RunDir {
     }
 }
 
-fn burn_version() -> String {
-    let manifest: toml::Table = MANIFEST.parse().expect("the manifest that Cargo read");
-    let pinned = manifest["workspace"]["dependencies"]["burn"]["version"].as_str();
-    let pinned = pinned.and_then(|version| version.strip_prefix('='));
-    pinned.expect("Burn is pinned").to_string()
+/// Whether the bytes of one of [`OWN_FILES`] in a run directory can be used. The record of a run
+/// never changes, so that of a checkpoint is preferred.
+pub fn is_usable(name: &str, bytes: &[u8]) -> bool {
+    let Ok(text) = str::from_utf8(bytes) else {
+        return false;
+    };
+    match name {
+        CONFIG => Config::parse(Path::new(CONFIG), text, &[]).is_ok(),
+        LAYOUT => toml::from_str::<ChannelLayout>(text).is_ok(),
+        _ => false,
+    }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
+/// The copy of a run's file in its newest intact checkpoint, if there is one.
+///
+/// # Errors
+/// A directory that cannot be read.
+pub fn copy_in_checkpoint(run: &Path, name: &str) -> anyhow::Result<Option<PathBuf>> {
+    let checkpoint = CheckpointStore::new(run).newest_intact()?.intact;
+    Ok(checkpoint
+        .map(|dir| dir.join(name))
+        .filter(|copy| copy.exists()))
+}
 
-    #[test]
-    fn the_recorded_version_of_burn_is_a_version() {
-        let version = burn_version();
-        let numbers = version.split('.').map(str::parse::<u32>);
-        assert_eq!(numbers.filter(Result::is_ok).count(), 3, "{version}");
+/// What a run directory has as its record.
+enum StoredRecord {
+    Missing,
+    Damaged,
+    Intact(Box<RunRecord>),
+}
+
+fn read_record(path: &Path) -> anyhow::Result<StoredRecord> {
+    match fs::read(path) {
+        Ok(bytes) => Ok(match serde_json::from_slice(&bytes) {
+            Ok(record) => StoredRecord::Intact(record),
+            Err(_) => StoredRecord::Damaged,
+        }),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(StoredRecord::Missing),
+        Err(error) => Err(error).with_context(|| path.display().to_string()),
     }
 }

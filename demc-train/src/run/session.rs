@@ -21,6 +21,8 @@ pub struct Session {
     estimate: DurationEstimate,
     /// Number of scenes in each split.
     pub data: String,
+    /// Suspicious signs in the data.
+    pub warnings: Vec<String>,
     /// Notes for the user.
     pub notes: Vec<String>,
     first_step: u64,
@@ -72,28 +74,33 @@ impl Session {
         if !check {
             dir.lock_if_present()?;
         }
-        let data = RunData::open(&config)?;
         let mut notes = Vec::new();
+        // First, because it restores a damaged layout.
+        let checkpoint = match resume {
+            true => latest_checkpoint(&config, dir.path(), !check, device, &mut notes)?,
+            false => None,
+        };
+        let data = RunData::open(&config)?;
+        if resume {
+            dir.check_scenes(&data)?;
+        }
         if data.clamped > 0 {
             let clamped = data.clamped;
             notes.push(format!(
                 "{clamped} negative radiance values are clamped to 0"
             ));
         }
-        let checkpoint = match resume {
-            true => latest_checkpoint(&config, dir.path(), !check, device, &mut notes)?,
-            false => None,
-        };
         let first_step = checkpoint.as_ref().map_or(0, |found| found.state.step);
         let autodiff = device.clone().autodiff();
         let estimate = DurationEstimate::measure(&config, &data, first_step, &autodiff);
-        let summary = data.summary();
+        let (summary, warnings) = (data.summary(), data.warnings.clone());
         let run = TrainingRun::new(config, data, dir, checkpoint, device)?;
         notes.extend(run.initial().map(|initial| initial.note(run.config())));
         Ok(Session {
             run,
             estimate,
             data: summary,
+            warnings,
             notes,
             first_step,
             device: device.clone(),

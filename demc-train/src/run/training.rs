@@ -1,8 +1,6 @@
 //! The training loop.
 
-use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use burn::module::Module;
@@ -20,7 +18,9 @@ use crate::run::checkpoint::store::{CheckpointRetention, CheckpointStore};
 use crate::run::checkpoint::{self, BestValidation, Checkpoint, LoopState, MetricSums};
 use crate::run::data::RunData;
 use crate::run::initial::{InitialNetwork, InitialWeights, initial_network};
-use crate::run::run_dir::{RunDir, RunFacts};
+use crate::run::run_dir::RunDir;
+use crate::run::run_record::RunFacts;
+use crate::run::session_clock::SessionClock;
 use crate::run::signals::Signals;
 use crate::run::validation::{self, Validation};
 use crate::run::warnings::LoopFacts;
@@ -160,7 +160,8 @@ impl TrainingRun {
     /// record.
     ///
     /// # Errors
-    /// A scene that cannot be read; a file that cannot be written; a non-finite loss.
+    /// A scene that cannot be read; a file that cannot be written; a non-finite loss in a step
+    /// that may not be skipped, or in all steps.
     pub fn train(&mut self, device: &str) -> anyhow::Result<LoopEnd> {
         let mut recorder = self.open_records(device)?;
         let (train, run) = (self.config.train.clone(), self.config.run.clone());
@@ -208,7 +209,18 @@ impl TrainingRun {
             }
         }
         recorder.finish();
+        ensure!(
+            !self.is_untrained(),
+            "all {} steps were skipped because of a non-finite loss or gradient, so the network is untrained; \
+             inspect the data with demc-data doctor, or try a smaller optimizer.lr_start",
+            self.state.step
+        );
         Ok(LoopEnd::Done)
+    }
+
+    /// Whether no step has changed the weights.
+    fn is_untrained(&self) -> bool {
+        self.state.skipped == self.state.step
     }
 
     fn open_records(&mut self, device: &str) -> anyhow::Result<Recorder> {
@@ -219,9 +231,9 @@ impl TrainingRun {
             patches: self.patches(),
             initial: self.initial.as_ref(),
         };
-        let note = self.dir.open(&self.config, &self.data, facts)?;
+        let notes = self.dir.open(&self.config, &self.data, facts)?;
         let recorder = Recorder::open(&self.dir, &self.config, self.state.step, self.patches())?;
-        if let Some(note) = note {
+        for note in notes {
             recorder.say(&format!("note: {note}"));
         }
         Ok(recorder)
@@ -303,7 +315,7 @@ impl TrainingRun {
 
     /// Scores and draws the validation scenes, and keeps the weights if they are the best so far.
     fn validate(&mut self, recorder: &mut Recorder) -> anyhow::Result<Option<Validation>> {
-        if self.data.validation.is_empty() {
+        if self.data.validation.is_empty() || self.is_untrained() {
             return Ok(None);
         }
         let bundle = self.bundle(self.trainer.result());
@@ -315,25 +327,15 @@ impl TrainingRun {
         }
         let relmse = found.report.mean.denoised.relmse;
         if self.state.best.is_none_or(|best| relmse < best.relmse) {
-            bundle.save(&self.best_path(), Names::Burn, Precision::F32)?;
+            bundle.save(&self.dir.path().join(BEST), Names::Burn, Precision::F32)?;
             self.state.best = Some(BestValidation { step, relmse });
         }
         Ok(Some(found))
     }
 
-    fn best_path(&self) -> PathBuf {
-        self.dir.path().join(BEST)
-    }
-
     /// One sentence on which weights the run keeps, and why.
     pub fn kept_weights(&self) -> String {
-        let steps = self.config.train.steps;
-        match self.state.best {
-            Some(BestValidation { step, relmse }) => format!(
-                "kept weights: those of step {step} of {steps}, with the best validation RelMSE {relmse:.4}"
-            ),
-            None => format!("kept weights: those of the last step {steps}, no scene is held out"),
-        }
+        self.state.kept_weights(self.config.train.steps)
     }
 
     fn metrics_line(&self, lr: f64, validation: Option<&Validation>) -> MetricsLine {
@@ -394,7 +396,7 @@ impl TrainingRun {
             return Ok(None);
         }
         let bundle = match self.state.best {
-            Some(_) => Bundle::load(&self.best_path(), device)?,
+            Some(_) => Bundle::load(&self.dir.path().join(BEST), device)?,
             None => self.bundle(self.trainer.result()),
         };
         let Validation {
@@ -406,39 +408,5 @@ impl TrainingRun {
         self.dir
             .write("test.json", &serde_json::to_vec_pretty(&report)?)?;
         Ok(Some((bundle.meta.step, report)))
-    }
-}
-
-/// The duration of a run over its sessions, and the time since the last checkpoint.
-struct SessionClock {
-    started: Instant,
-    /// Seconds of earlier sessions.
-    before: f64,
-    saved: Instant,
-    interval: Duration,
-}
-
-impl SessionClock {
-    fn new(before: f64, interval: Duration) -> Self {
-        let now = Instant::now();
-        SessionClock {
-            started: now,
-            before,
-            saved: now,
-            interval,
-        }
-    }
-
-    fn elapsed(&self) -> f64 {
-        self.before + self.started.elapsed().as_secs_f64()
-    }
-
-    fn checkpoint_saved(&mut self) {
-        self.saved = Instant::now();
-    }
-
-    /// Whether `run.checkpoint_minutes` have passed.
-    fn checkpoint_is_due(&self) -> bool {
-        self.saved.elapsed() >= self.interval
     }
 }

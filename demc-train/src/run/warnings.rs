@@ -36,6 +36,7 @@ const DORMANT: f64 = 0.3;
 #[serde(rename_all = "kebab-case")]
 enum WarningTopic {
     NotFalling,
+    ZeroLoss,
     Climbing,
     OneScene,
     DeadChannels,
@@ -113,19 +114,31 @@ impl RunMonitor {
         }
         self.best = self.best.min(mean);
         let (first, best) = (self.first, self.best);
-        if mean >= RISEN * best {
+        if mean == 0.0 {
+            return self.once(WarningTopic::ZeroLoss, || {
+                format!(
+                    "the loss is 0 over the last {length} steps, so nothing is learned; are the references black? \
+                     `demc-data doctor` inspects them"
+                )
+            });
+        }
+        if best > 0.0 && mean >= RISEN * best {
             return self.once(WarningTopic::Climbing, || {
                 format!(
-                    "the loss rises: mean {mean:.4} over the last {length} steps, {best:.4} over the best {length}; \
-                     a smaller optimizer.lr_start or optimizer.max_grad_norm = 1.0 usually helps"
+                    "the loss rises: mean {} over the last {length} steps, {} over the best {length}; \
+                     a smaller optimizer.lr_start or optimizer.max_grad_norm = 1.0 usually helps",
+                    shown(mean),
+                    shown(best)
                 )
             });
         }
         if self.windows >= PATIENCE && best >= FALLEN * first {
             return self.once(WarningTopic::NotFalling, || {
                 format!(
-                    "the loss stalls: mean {mean:.4} over the last {length} steps, {first:.4} over the first {length}; \
-                     `demc-train find-lr` finds a learning rate"
+                    "the loss stalls: mean {} over the last {length} steps, {} over the first {length}; \
+                     `demc-train find-lr` finds a learning rate",
+                    shown(mean),
+                    shown(first)
                 )
             });
         }
@@ -140,7 +153,7 @@ impl RunMonitor {
             .copied()
             .enumerate()
             .max_by(|a, b| a.1.total_cmp(&b.1))?;
-        if names.len() < MIN_SCENES || most < DOMINANT * sum {
+        if names.len() < MIN_SCENES || sum <= 0.0 || most < DOMINANT * sum {
             return None;
         }
         let (name, share) = (&names[scene], 100.0 * most / sum);
@@ -201,6 +214,14 @@ impl RunMonitor {
     }
 }
 
+/// A loss with four decimals; a smaller one with its exponent.
+fn shown(loss: f64) -> String {
+    match loss != 0.0 && loss.abs() < 0.001 {
+        true => format!("{loss:.2e}"),
+        false => format!("{loss:.4}"),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -258,6 +279,16 @@ mod tests {
         let said = run(losses, 10);
         assert_eq!(said.len(), 1, "{said:?}");
         assert!(said[0].starts_with("the loss rises: mean 2.0000"));
+    }
+
+    #[test]
+    fn a_zero_loss_is_reported_once_and_has_no_dominant_scene() {
+        let said = run((0..2000).map(|_| 0.0), 10);
+        assert_eq!(said.len(), 1, "{said:?}");
+        assert!(said[0].starts_with("the loss is 0 over the last 100 steps"));
+        let said = run((0..1000).map(|i| if i < 600 { 1e-6 } else { 1.0 }), 10);
+        let rises = |line: &String| line.contains("1.00e-6 over the best 100");
+        assert!(said.iter().any(rises), "{said:?}");
     }
 
     #[test]

@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 use serde::Deserialize;
 
+use crate::record::metrics_log::{StoredLines, damaged_lines, read_lines};
 use crate::tools::chart::figure::{AxisScale, Figure, LinePanel, Series};
+use crate::usage::UsageError;
 
 const METRICS: &str = "metrics.jsonl";
 
@@ -21,6 +23,15 @@ pub struct PlotOptions {
     pub linear: bool,
 }
 
+/// Drawn curves.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Curves {
+    /// The chart.
+    pub path: PathBuf,
+    /// A note for each log with damaged lines.
+    pub notes: Vec<String>,
+}
+
 #[derive(Clone, Copy, Debug, Deserialize)]
 struct LoggedValues {
     step: u64,
@@ -30,43 +41,54 @@ struct LoggedValues {
 }
 
 /// Draws the curves of run directories to STEM.svg: smoothed training loss over its faint raw
-/// values, and validation RelMSE and SSIM if any. Returns the path.
+/// values, and validation RelMSE and SSIM if any.
 ///
-/// Each run has one colour and the shortest unique end of its path as name. An incomplete last line
-/// of a log is skipped.
+/// Each run has one colour and the shortest unique end of its path as name. Damaged lines of a log
+/// and an incomplete last one are skipped.
 ///
 /// # Errors
-/// No runs; a run named twice or without a log; an invalid line; a weight outside 0 to 1; a file
-/// that cannot be written.
-pub fn plot(runs: &[PathBuf], stem: &Path, options: &PlotOptions) -> anyhow::Result<PathBuf> {
-    ensure!(!runs.is_empty(), "no runs to plot");
-    ensure!(
-        (0.0..1.0).contains(&options.smooth),
-        "smoothing: expected a weight from 0 to below 1, found {}",
-        options.smooth
-    );
+/// [`UsageError`]: no runs, a run named twice, a weight outside 0 to 1. A run without a log; no value
+/// in any log; a file that cannot be written.
+pub fn plot(runs: &[PathBuf], stem: &Path, options: &PlotOptions) -> anyhow::Result<Curves> {
+    if runs.is_empty() {
+        return Err(UsageError("no runs to plot".into()).into());
+    }
+    if !(0.0..1.0).contains(&options.smooth) {
+        let smooth = options.smooth;
+        let text = format!("smoothing: expected a weight from 0 to below 1, found {smooth}");
+        return Err(UsageError(text).into());
+    }
     let names = names(runs)?;
-    let logs = runs.iter().map(|run| log(&run.join(METRICS)));
-    let logs: Vec<_> = logs.collect::<anyhow::Result<_>>()?;
+    let mut logs = Vec::with_capacity(runs.len());
+    let mut notes = Vec::new();
+    for run in runs {
+        let (lines, note) = log(&run.join(METRICS))?;
+        logs.push(lines);
+        notes.extend(note);
+    }
     let named: Vec<_> = names.iter().zip(&logs).collect();
-    Figure(panels(&named, options)).write(stem)
+    let panels = panels(&named, options);
+    let has_points = |panel: &LinePanel| {
+        let mut points = panel.series.iter().flat_map(|curve| &curve.points);
+        points.any(|point| point.1.is_finite())
+    };
+    ensure!(
+        panels.iter().any(has_points),
+        "{}: no values to draw yet",
+        runs[0].join(METRICS).display()
+    );
+    let path = Figure(panels).write(stem)?;
+    Ok(Curves { path, notes })
 }
 
-fn log(path: &Path) -> anyhow::Result<Vec<LoggedValues>> {
-    let text = fs::read_to_string(path)
+/// The values of a log, and a note about damaged lines.
+fn log(path: &Path) -> anyhow::Result<(Vec<LoggedValues>, Option<String>)> {
+    let bytes = fs::read(path)
         .with_context(|| format!("{}: cannot read the log of a run", path.display()))?;
-    let mut lines = Vec::new();
-    for (i, line) in text.split_inclusive('\n').enumerate() {
-        match serde_json::from_str(line) {
-            Ok(line) => lines.push(line),
-            Err(_) if !line.ends_with('\n') => {}
-            Err(error) => {
-                let place = format!("{}: line {}", path.display(), i + 1);
-                return Err(error).context(place);
-            }
-        }
-    }
-    Ok(lines)
+    let StoredLines { lines, damaged } = read_lines(&bytes);
+    let skipped = || format!("{}: {} skipped", path.display(), damaged_lines(&damaged));
+    let note = (!damaged.is_empty()).then(skipped);
+    Ok((lines.into_iter().map(|(_, values)| values).collect(), note))
 }
 
 /// Training loss, and validation RelMSE and SSIM if a run has any.
@@ -175,7 +197,9 @@ fn names(runs: &[PathBuf]) -> anyhow::Result<Vec<String>> {
     }
     let mut seen = HashSet::new();
     for (run, path) in runs.iter().zip(&paths) {
-        ensure!(seen.insert(path), "{}: named twice", run.display());
+        if !seen.insert(path) {
+            return Err(UsageError(format!("{}: named twice", run.display())).into());
+        }
     }
     let name = |path: &PathBuf| {
         let depth = path.components().count();
@@ -246,7 +270,7 @@ mod tests {
     fn a_log_with_validation_has_three_panels() {
         let dir = tempfile::tempdir().unwrap();
         let run = run(dir.path(), "a", LOG);
-        let lines = log(&run.join(METRICS)).unwrap();
+        let (lines, _) = log(&run.join(METRICS)).unwrap();
         let drawn = panels(&[(&"a".to_string(), &lines)], &OPTIONS);
         let [loss, relmse, ssim] = &drawn[..] else {
             panic!("{} panels", drawn.len())
@@ -272,19 +296,20 @@ mod tests {
     }
 
     #[test]
-    fn an_incomplete_end_is_skipped_and_an_invalid_line_named() {
+    fn an_incomplete_end_is_skipped_and_a_damaged_line_named() {
         let dir = tempfile::tempdir().unwrap();
         let torn = run(dir.path(), "torn", &format!("{LOG}{{\"step\":100,\"lo"));
-        assert_eq!(log(&torn.join(METRICS)).unwrap().len(), 3);
+        assert_eq!(log(&torn.join(METRICS)).unwrap().0.len(), 3);
         let broken = run(
             dir.path(),
             "broken",
             &LOG.replacen("\"step\":50", "\"step\":", 1),
         );
         let stem = dir.path().join("chart");
-        let error = failure(&[torn, broken], &stem, &OPTIONS);
-        assert!(error.contains("broken/metrics.jsonl: line 2: "), "{error}");
-        assert!(!dir.path().join("chart.svg").exists());
+        let drawn = plot(&[torn, broken.clone()], &stem, &OPTIONS).unwrap();
+        let path = broken.join(METRICS);
+        let note = format!("{}: damaged line 2 skipped", path.display());
+        assert_eq!(drawn.notes, [note]);
     }
 
     #[test]
@@ -305,8 +330,8 @@ mod tests {
             .iter()
             .map(|(name, log)| run(dir.path(), name, log))
             .collect();
-        let svg = plot(&runs, &dir.path().join("chart"), &OPTIONS).unwrap();
-        let text = fs::read_to_string(svg).unwrap();
+        let drawn = plot(&runs, &dir.path().join("chart"), &OPTIONS).unwrap();
+        let text = fs::read_to_string(drawn.path).unwrap();
         for name in [
             "full",
             "no-validation",
@@ -318,11 +343,12 @@ mod tests {
             assert!(text.contains(&format!("\n{name}\n")), "{name}");
         }
         assert!(!text.contains("no data"));
-        let svg = plot(&runs[2..], &dir.path().join("empty"), &OPTIONS).unwrap();
-        let text = fs::read_to_string(svg).unwrap();
-        // Only the panel of the training loss, without a curve.
-        assert_eq!(text.matches("\nno data\n").count(), 1);
-        assert!(!text.contains("validation"));
+        let error = failure(&runs[2..], &dir.path().join("empty"), &OPTIONS);
+        assert!(
+            error.ends_with("empty/metrics.jsonl: no values to draw yet"),
+            "{error}"
+        );
+        assert!(!dir.path().join("empty.svg").exists());
     }
 
     #[test]

@@ -29,7 +29,7 @@ use demc_model::Denoiser;
 use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
-use crate::run::run_dir::OWN_FILES;
+use crate::run::run_dir::{OWN_FILES, is_usable};
 use crate::run::warnings::RunMonitor;
 use crate::step::optimizer::Optimizer;
 use store::{CheckpointRetention, CheckpointStore};
@@ -90,6 +90,16 @@ impl LoopState {
             since_log: MetricSums::default(),
             watch: RunMonitor::default(),
             elapsed_s: 0.0,
+        }
+    }
+
+    /// One sentence on which weights a run of `steps` steps keeps, and why.
+    pub fn kept_weights(&self, steps: u64) -> String {
+        match self.best {
+            Some(BestValidation { step, relmse }) => format!(
+                "kept weights: those of step {step} of {steps}, with the best validation RelMSE {relmse:.4}"
+            ),
+            None => format!("kept weights: those of the last step {steps}, no scene is held out"),
         }
     }
 }
@@ -194,7 +204,7 @@ fn read_state(path: &Path) -> anyhow::Result<LoopState> {
 }
 
 /// Restores the run in `run` to the checkpoint `dir`: its best weights, and the run's files if they
-/// are missing. Returns a note for each restored file.
+/// are missing or damaged. Returns a note for each restored file.
 ///
 /// # Errors
 /// A file that cannot be read or written.
@@ -206,16 +216,20 @@ pub fn restore_run(run: &Path, dir: &Path) -> anyhow::Result<Vec<String>> {
             continue;
         }
         let bytes = fs::read(&saved).with_context(|| saved.display().to_string())?;
-        match fs::read(&current) {
+        let state = match fs::read(&current) {
+            Ok(found) if found == bytes || is_usable(name, &found) => continue,
             // Best weights may be of a later step, which the run repeats.
-            Ok(found) if name != BEST || found == bytes => continue,
-            Ok(_) => {}
-            Err(_) => notes.push(format!(
-                "{} was missing: restored from {}",
+            Ok(_) if name == BEST => None,
+            Ok(_) => Some("damaged"),
+            Err(_) => Some("missing"),
+        };
+        notes.extend(state.map(|state| {
+            format!(
+                "{} was {state}: restored from {}",
                 current.display(),
                 dir.display()
-            )),
-        }
+            )
+        }));
         write_whole(&current, |file| file.write_all(&bytes))?;
     }
     Ok(notes)

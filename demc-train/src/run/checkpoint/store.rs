@@ -7,18 +7,17 @@
 
 use std::fmt::Write as _;
 use std::fs::{self, File};
-use std::io::{Read, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
+use demc_data::checksum::{sha256, sha256_of};
 use demc_data::file::{sync_dir, write_whole};
+use demc_infer::bundle::checksum::{SUMS, sums};
 use demc_infer::bundle::locate::{CHECKPOINTS, LATEST};
-use sha2::{Digest, Sha256};
 
-const SUMS: &str = "SHA256SUMS";
 /// Suffix of an unfinished checkpoint.
 const UNFINISHED: &str = ".tmp";
-const PIECE: usize = 1 << 20;
 
 /// Which checkpoints are kept.
 #[derive(Clone, Copy, Debug)]
@@ -187,10 +186,10 @@ fn fill(
 ) -> anyhow::Result<()> {
     remove(dir)?;
     fs::create_dir_all(dir).with_context(|| dir.display().to_string())?;
-    let mut sums = String::new();
+    let mut list = String::new();
     for (name, bytes) in files {
         write_synced(&dir.join(name), bytes)?;
-        let _ = writeln!(sums, "{}  {name}", hex(&Sha256::digest(bytes)));
+        let _ = writeln!(list, "{}  {name}", sha256([&bytes[..]]));
     }
     if let Some((name, from)) = linked {
         let to = dir.join(name);
@@ -198,9 +197,9 @@ fn fill(
         fs::hard_link(from, &to)
             .or_else(|_| fs::copy(from, &to).map(drop))
             .with_context(|| to.display().to_string())?;
-        let _ = writeln!(sums, "{}  {name}", sha256_of(&to)?);
+        let _ = writeln!(list, "{}  {name}", sha256_of(&to)?);
     }
-    write_synced(&dir.join(SUMS), sums.as_bytes())?;
+    write_synced(&dir.join(SUMS), list.as_bytes())?;
     sync(dir)
 }
 
@@ -219,49 +218,13 @@ fn sync(dir: &Path) -> anyhow::Result<()> {
 
 /// Fails with the first file that does not match its checksum.
 fn verify(dir: &Path) -> anyhow::Result<()> {
-    let path = dir.join(SUMS);
-    let text = fs::read_to_string(&path).with_context(|| path.display().to_string())?;
-    for line in text.lines() {
-        let Some((sum, name)) = line.split_once("  ") else {
-            bail!(
-                "{}: expected `CHECKSUM  FILE`, found `{line}`",
-                path.display()
-            );
-        };
+    for (sum, name) in sums(dir)? {
         let file = dir.join(name);
         if sha256_of(&file)? != sum {
             bail!("{}: damaged, its checksum differs", file.display());
         }
     }
-    if text.is_empty() {
-        bail!("{}: empty", path.display());
-    }
     Ok(())
-}
-
-/// The SHA-256 of a file, in hexadecimal digits.
-///
-/// # Errors
-/// A file that cannot be read.
-pub fn sha256_of(path: &Path) -> anyhow::Result<String> {
-    let read = || -> std::io::Result<String> {
-        let mut file = File::open(path)?;
-        let (mut sum, mut piece) = (Sha256::new(), vec![0; PIECE]);
-        loop {
-            match file.read(&mut piece)? {
-                0 => return Ok(hex(&sum.finalize())),
-                read => sum.update(&piece[..read]),
-            }
-        }
-    };
-    read().with_context(|| path.display().to_string())
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().fold(String::new(), |mut text, byte| {
-        let _ = write!(text, "{byte:02x}");
-        text
-    })
 }
 
 fn remove(dir: &Path) -> anyhow::Result<()> {

@@ -73,6 +73,9 @@ pub fn run(
             let session = Session::open(config.clone(), options, device, device_name)
                 .with_context(|| name.clone())?;
             say(format!("\n== {name}: {}", session.headline()));
+            for warning in &session.warnings {
+                say(format!("warning: {warning}"));
+            }
             for note in &session.notes {
                 say(format!("note: {note}"));
             }
