@@ -6,11 +6,13 @@ use std::path::{Path, PathBuf};
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
 use demc_data::ChannelLayout;
+use demc_data::output::Outputs;
 use demc_infer::verify::{Runtime, TOLERANCE, verify};
 use demc_infer::{Bundle, Names, Precision};
 
 use super::flags::ModelFlag;
-use super::{UsageError, not_an_input, print};
+use super::layouts::LAYOUT;
+use super::{UsageError, check_output, print};
 
 /// Variable with the interpreter for `--verify`.
 const PYTHON_VARIABLE: &str = "DEMC_PYTHON";
@@ -79,9 +81,17 @@ enum PrecisionFlag {
 
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
-        let file = self.model.read()?;
         // Rounding to f16 cannot be undone, so an export must not replace its model.
-        not_an_input(&self.output, &[(&file.path, "the model")])?;
+        let mut outputs = Outputs::default();
+        self.model.protect(&mut outputs);
+        if let Some(layout) = &self.layout {
+            outputs.protect(Path::new(layout), LAYOUT);
+        }
+        if let Some(python) = &self.python {
+            outputs.protect(python, "the Python interpreter");
+        }
+        check_output(outputs, &self.output)?;
+        let file = self.model.read()?;
         let names = match self.names {
             NamesFlag::Burn => Names::Burn,
             NamesFlag::Torch => Names::Torch,

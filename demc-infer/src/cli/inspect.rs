@@ -12,7 +12,7 @@ use demc_infer::{Bundle, BundleMeta, Names, Precision};
 use serde::Serialize;
 
 use super::flags::ModelFlag;
-use super::print;
+use super::{print, utf8_for_json};
 
 /// Show a model: network, training step, statistics and input channels.
 ///
@@ -48,6 +48,9 @@ impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let source = self.model.read()?;
         let (file, names, precision) = (source.path.clone(), source.names, source.precision);
+        if self.json {
+            utf8_for_json(&file)?;
+        }
         let Bundle { meta, .. } = source.into_bundle(&Device::flex())?;
         let specs = meta.model.weight_specs().into_iter();
         let tensors = match self.tensors {

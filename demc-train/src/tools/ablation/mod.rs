@@ -10,7 +10,7 @@ pub mod spec;
 mod table;
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use burn::tensor::Device;
@@ -20,12 +20,10 @@ use crate::record::metrics_log;
 use crate::record::progress::say;
 use crate::run::checkpoint::store::CheckpointStore;
 use crate::run::initial::read_init;
+use crate::run::run_dir::SCORES;
 use crate::run::session::{Session, SessionOptions, SessionOutcome};
 use comparison::{Comparison, FinishedRun};
 use spec::AblationSpec;
-
-/// Scores of the test split in a run directory.
-const SCORES: &str = "test.json";
 
 /// How an ablation ended.
 #[derive(Debug)]
@@ -72,6 +70,7 @@ pub fn run(
             };
             let session = Session::open(config.clone(), options, device, device_name)
                 .with_context(|| name.clone())?;
+            session.check_outputs(&spec.files)?;
             say(format!("\n== {name}: {}", session.headline()));
             for note in &session.notes {
                 say(format!("note: {note}"));
@@ -125,11 +124,16 @@ fn finished(config: &Config) -> anyhow::Result<Option<FinishedRun>> {
     Ok(Some(FinishedRun { report, seconds }))
 }
 
+/// The files that [`write`] writes into `dir`.
+pub fn files(dir: &Path) -> [PathBuf; 3] {
+    table::files(dir)
+}
+
 /// Writes table and figure of a comparison into `dir`; returns the paths.
 ///
 /// # Errors
 /// A file that cannot be written.
-pub fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<Vec<std::path::PathBuf>> {
+pub fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<[PathBuf; 3]> {
     table::write(comparison, dir)
 }
 
