@@ -41,7 +41,7 @@ WRITERS = [
     Writer("denoise", ["demc-infer", "denoise", "many", "-o", "kill", "--png", *MODEL], ["kill"]),
     Writer("report", ["demc-infer", "report", "--data", "data", "-o", "kill.html", *MODEL], ["kill.html"]),
     Writer("index", ["demc-data", "index", "many"], ["many/manifest.json"], ["--overwrite"]),
-    Writer("merge", ["demc-data", "merge", "x=frame.exr", outputs.BASELINE, "-o", "kill.exr"], ["kill.exr"],
+    Writer("merge", ["demc-data", "merge", "x=frame.exr", "bare/scene.exr", "-o", "kill.exr"], ["kill.exr"],
            ["--overwrite"]),
 ]
 

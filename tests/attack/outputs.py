@@ -10,8 +10,7 @@ from common import SAMPLE
 
 LAYOUT = SAMPLE.parents[1] / "configs" / "renderers" / "demc-exr.toml"
 MODEL = ["model.safetensors"]
-RUN = ["run/best.safetensors", "run/config.toml", "run/metrics.jsonl", "run/latest"]
-BASELINE = "baseline/scene.exr"
+RUN = ["run/config.toml", "run/metrics.jsonl", "run/latest", "run/checkpoints/step-00000002/model.safetensors"]
 
 
 def cut(path, ending):
@@ -44,7 +43,8 @@ class Output:
 def outputs(project):
     """All outputs in a prepared project."""
     scenes = ["data/manifest.json", *sorted(str(p.relative_to(project)) for p in project.glob("data/*/*.exr"))]
-    scored = scenes + MODEL + ["layout.toml", BASELINE]
+    baseline = str(next(project.glob("baseline/*.exr")).relative_to(project))
+    scored = scenes + MODEL + ["layout.toml", baseline]
     scoring = ["--data", "data", "--model", "model.safetensors", "--layout", "layout.toml", "--baseline", "b=baseline"]
     denoise = ["demc-infer", "denoise", "frame.exr", "--model", "model.safetensors", "--layout", "layout.toml"]
     tiny = ["--config", "tiny.toml"]
@@ -68,8 +68,8 @@ def outputs(project):
         Output("import", "back.safetensors",
                lambda o: ["demc-infer", "import", "tuned.safetensors", "--like", "run", "-o", o],
                ["tuned.safetensors", *RUN]),
-        Output("merge", "merged.exr", lambda o: ["demc-data", "merge", "x=frame.exr", BASELINE, "-o", o],
-               ["frame.exr", BASELINE], overwrite=True),
+        Output("merge", "merged.exr", lambda o: ["demc-data", "merge", "x=frame.exr", "bare/scene.exr", "-o", o],
+               ["frame.exr", "bare/scene.exr"], overwrite=True),
         Output("index", "bare/manifest.json",
                lambda o: ["demc-data", "index", o or ".", "--layout", "bare/layout.toml"],
                ["bare/scene.exr", "bare/layout.toml"], fixed=True, overwrite=True),
@@ -98,7 +98,6 @@ def prepare(project):
     for folder in ("baseline", "bare"):
         (project / folder).mkdir()
     shutil.copy(test, project / "baseline" / test.name)
-    shutil.copy(test, project / BASELINE)
     shutil.copy(test, project / "bare" / "scene.exr")
     shutil.copy(LAYOUT, project / "bare" / "layout.toml")
     project.joinpath("ablation.toml").write_text(
@@ -107,6 +106,6 @@ def prepare(project):
 
 
 def contents(project):
-    """The bytes of every file."""
-    project = pathlib.Path(project)
-    return {p: p.read_bytes() for p in project.rglob("*") if p.is_file()}
+    """The bytes of every file, but not the lock of a run."""
+    files = (p for p in pathlib.Path(project).rglob("*") if p.is_file() and p.name != "lock")
+    return {p: p.read_bytes() for p in files}
