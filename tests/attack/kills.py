@@ -21,33 +21,37 @@ import time
 import common
 import outputs
 
-# What differs between two runs of the same training: times and speeds.
-VARYING = {"metrics.jsonl", "lock"}
-TRAIN = ["demc-train", "--config", "tiny.toml", "--run-dir", "kill", "--set", "train.steps=6",
+# Files that differ between two runs of the same training, because they contain times or their checksums.
+VARYING = {"metrics.jsonl", "lock", "state.json", "SHA256SUMS"}
+MAX_PROBLEMS = 20
+TRAIN = ["demc-train", "--config", "tiny.toml", "--run-dir", "kill", "--set", "train.steps=4",
          "--set", "run.checkpoint_every=1", "--set", "run.validate_every=2"]
 MODEL = ["--model", "model.safetensors"]
 
 
 class Writer:
-    """A command, the command that finishes its work after a kill, and its outputs (files or directories)."""
+    """A command, the command that finishes its work after a kill, and its outputs (files or directories).
 
-    def __init__(self, name, command, made, again=()):
-        self.name, self.command, self.made = name, command, made
+    weight: how often it is killed.
+    """
+
+    def __init__(self, name, weight, command, made, again=()):
+        self.name, self.weight, self.command, self.made = name, weight, command, made
         self.again = [*command, *again]
 
 
 WRITERS = [
-    Writer("train", TRAIN, ["kill"], ["--resume"]),
-    Writer("denoise", ["demc-infer", "denoise", "many", "-o", "kill", "--png", *MODEL], ["kill"]),
-    Writer("report", ["demc-infer", "report", "--data", "data", "-o", "kill.html", *MODEL], ["kill.html"]),
-    Writer("index", ["demc-data", "index", "many"], ["many/manifest.json"], ["--overwrite"]),
-    Writer("merge", ["demc-data", "merge", "x=frame.exr", "bare/scene.exr", "-o", "kill.exr"], ["kill.exr"],
+    Writer("train", 1, TRAIN, ["kill"], ["--resume"]),
+    Writer("denoise", 3, ["demc-infer", "denoise", "many", "-o", "kill", "--png", *MODEL], ["kill"]),
+    Writer("report", 2, ["demc-infer", "report", "--data", "data", "-o", "kill.html", *MODEL], ["kill.html"]),
+    Writer("index", 3, ["demc-data", "index", "many"], ["many/manifest.json"], ["--overwrite"]),
+    Writer("merge", 4, ["demc-data", "merge", "x=frame.exr", "bare/scene.exr", "-o", "kill.exr"], ["kill.exr"],
            ["--overwrite"]),
 ]
 
 
 def written(project, writer):
-    """The bytes of each output that has the same bytes in every run; None for others."""
+    """The bytes of each output; None for a file that differs from run to run."""
     found = {}
     for made in writer.made:
         place = project / made
@@ -126,8 +130,8 @@ def attack(count, seed):
     kills, problems = collections.Counter(), []
     with temporary:
         known = {}
-        for number in range(count):
-            writer = WRITERS[number % len(WRITERS)]
+        while sum(kills.values()) < count and len(problems) < MAX_PROBLEMS:
+            writer = chance.choices(WRITERS, [writer.weight for writer in WRITERS])[0]
             clean(project, writer)
             if writer.name not in known:
                 begin = time.monotonic()
@@ -135,8 +139,11 @@ def attack(count, seed):
                 known[writer.name] = written(project, writer), time.monotonic() - begin
                 clean(project, writer)
             expected, seconds = known[writer.name]
-            killed, wrong = problem(project, writer, expected, chance.uniform(0, seconds))
+            after = chance.uniform(0, seconds)
+            killed, wrong = problem(project, writer, expected, after)
             kills[writer.name] += killed
+            if not killed:  # The computer is faster than it was.
+                known[writer.name] = expected, after
             if wrong:
                 problems.append(f"{writer.name}: {wrong}")
                 print(problems[-1], file=sys.stderr)
@@ -145,7 +152,7 @@ def attack(count, seed):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=40, help="number of attempts (default: 40)")
+    parser.add_argument("--count", type=int, default=40, help="number of kills (default: 40)")
     parser.add_argument("--seed", type=int, default=None, help="seed of the moments (default: random)")
     arguments = parser.parse_args()
     seed = random.SystemRandom().randrange(1 << 32) if arguments.seed is None else arguments.seed

@@ -120,7 +120,7 @@ class Outputs(Attack):
         (out / "frame.png").write_bytes(b"mine")
         result = self.run_program(*denoise, "frame.exr", "-o", "out")
         self.assertEqual(result.code, 0, result)
-        self.assertIn("1 previews already exist; --overwrite replaces them", result.stderr)
+        self.assertIn("existing previews are kept: 1; --overwrite replaces them", result.stderr)
         self.assertEqual((out / "frame.png").read_bytes(), b"mine")
         (out / "frame.png").unlink()
         (out / "frame.exr").write_bytes(b"mine")

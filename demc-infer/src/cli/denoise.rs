@@ -68,7 +68,7 @@ pub struct Arguments {
     /// image with NaN or infinite samples is refused, and negative radiance counts as 0
     #[arg(long)]
     repair: bool,
-    /// Replace existing outputs. Inputs are never replaced
+    /// Replace existing outputs and previews. Inputs are never replaced
     #[arg(long)]
     overwrite: bool,
     /// Only these frames of sequences
@@ -76,7 +76,7 @@ pub struct Arguments {
     frames: Option<Frames>,
     #[command(flatten)]
     output_flags: OutputFlags,
-    /// Also write a preview NAME.png beside each output: clip(2^EXPOSURE x, 0, 1)^(1/2.2)
+    /// Also write a preview NAME.png beside each output, unless it exists: clip(2^EXPOSURE x, 0, 1)^(1/2.2)
     #[arg(long)]
     png: bool,
     /// Exposure of previews in stops
@@ -115,7 +115,7 @@ impl Arguments {
         }
         if jobs.kept_previews > 0 {
             let kept = jobs.kept_previews;
-            eprintln!("note: {kept} previews already exist; --overwrite replaces them");
+            eprintln!("note: existing previews are kept: {kept}; --overwrite replaces them");
         }
         let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
