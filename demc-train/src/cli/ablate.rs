@@ -4,10 +4,8 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Args;
-use demc_data::output::{Directories, Outputs};
 use demc_train::config::utf8;
 use demc_train::record::progress::say;
-use demc_train::run::inputs;
 use demc_train::tools::ablation::spec::AblationSpec;
 use demc_train::tools::ablation::{self, AblationOutcome};
 
@@ -43,14 +41,6 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         spec.dir = utf8("--run-dir", &dir)?.into();
     }
     let device = arguments.compute.device()?;
-    let mut outputs = Outputs::default();
-    for variant in &spec.variants {
-        inputs::protect(&mut outputs, &spec.files, &variant.config)?;
-    }
-    for file in ablation::files(&spec.dir) {
-        outputs.claim(&file, true)?;
-    }
-    outputs.prepare(Directories::Create)?;
     for variant in &spec.variants {
         let model = &variant.config.model;
         say(format!(

@@ -14,12 +14,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use burn::tensor::Device;
+use demc_data::output::{Directories, Outputs};
 
 use crate::config::Config;
 use crate::record::metrics_log;
 use crate::record::progress::say;
 use crate::run::checkpoint::store::CheckpointStore;
 use crate::run::initial::read_init;
+use crate::run::inputs;
 use crate::run::run_dir::SCORES;
 use crate::run::session::{Session, SessionOptions, SessionOutcome};
 use comparison::{Comparison, FinishedRun};
@@ -42,7 +44,8 @@ pub enum AblationOutcome {
 /// Trains every run of `spec` that is not complete, and compares them. `device` has no autodiff.
 ///
 /// # Errors
-/// Before any training, a `train.init` of another network; a run that cannot be trained or read; no
+/// Before any training, a `train.init` of another network, or a result that would replace an input
+/// or cannot be written; a run that cannot be trained or read; no
 /// test split.
 pub fn run(
     spec: &AblationSpec,
@@ -50,6 +53,7 @@ pub fn run(
     device_name: &str,
 ) -> anyhow::Result<AblationOutcome> {
     check_init(spec)?;
+    check_outputs(spec)?;
     let total = spec.seeds.len() * spec.variants.len();
     let mut runs = vec![Vec::new(); spec.variants.len()];
     let mut number = 0;
@@ -103,6 +107,17 @@ fn check_init(spec: &AblationSpec) -> anyhow::Result<()> {
     Ok(())
 }
 
+fn check_outputs(spec: &AblationSpec) -> anyhow::Result<()> {
+    let mut outputs = Outputs::default();
+    for variant in &spec.variants {
+        inputs::protect(&mut outputs, &spec.files, &variant.config)?;
+    }
+    for file in table::files(&spec.dir) {
+        outputs.claim(&file, true)?;
+    }
+    Ok(outputs.prepare(Directories::Create)?)
+}
+
 fn finished(config: &Config) -> anyhow::Result<Option<FinishedRun>> {
     let dir = config.run_dir();
     let scores = dir.join(SCORES);
@@ -122,11 +137,6 @@ fn finished(config: &Config) -> anyhow::Result<Option<FinishedRun>> {
     let report = serde_json::from_str(&text).with_context(|| scores.display().to_string())?;
     let seconds = metrics_log::elapsed(&dir.join("metrics.jsonl")).unwrap_or(f64::NAN);
     Ok(Some(FinishedRun { report, seconds }))
-}
-
-/// The files that [`write`] writes into `dir`.
-pub fn files(dir: &Path) -> [PathBuf; 3] {
-    table::files(dir)
 }
 
 /// Writes table and figure of a comparison into `dir`; returns the paths.
