@@ -1,14 +1,22 @@
 //! Output files that are complete or absent.
 
-use std::fs::{self, File};
+use std::collections::HashSet;
+use std::ffi::{OsStr, OsString};
+use std::fs::{self, File, TryLockError};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use crate::Error;
 
+/// Age from which a temporary file counts as abandoned on a file system without locks. Ours: no file
+/// takes that long.
+const ABANDONED: Duration = Duration::from_secs(24 * 3600);
+
 /// Writes `path` through `fill`: to a temporary name in the same directory, flushed to the disk,
-/// mode 0644, then renamed. Readers of `path` see either the old or the new file. A symbolic link
-/// stays, and its target is replaced.
+/// then renamed. Readers of `path` see either the old or the new file. A symbolic link stays, and
+/// its target is replaced. The file has the permissions of the one that it replaces, or follows the
+/// umask.
 ///
 /// # Errors
 /// [`Error::Write`], naming `path`; the temporary file is removed. If `path` is a device, a FIFO or
@@ -22,28 +30,117 @@ pub fn write_whole(
         source,
     };
     let target = target_of(path).map_err(error)?;
-    let temporary = temporary_beside(&target).map_err(error)?;
-    fill_and_rename(&temporary, &target, fill).map_err(|source| {
-        // Reports the first error; the temporary file may not exist.
+    let (temporary, file) = create_beside(&target).map_err(error)?;
+    fill_and_rename(file, &temporary, &target, fill).map_err(|source| {
+        // Reports the first error.
         let _ = fs::remove_file(&temporary);
         error(source)
     })
 }
 
 fn fill_and_rename(
+    file: File,
     temporary: &Path,
     path: &Path,
     fill: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
 ) -> io::Result<()> {
-    let mut writer = BufWriter::new(File::create(temporary)?);
+    let mut writer = BufWriter::new(file);
     fill(&mut writer)?;
     writer.flush()?;
-    let file = writer.get_ref();
-    #[cfg(unix)]
-    file.set_permissions(std::os::unix::fs::PermissionsExt::from_mode(0o644))?;
-    file.sync_all()?;
+    writer.get_ref().sync_all()?;
     fs::rename(temporary, path)?;
     sync_dir(path.parent().unwrap_or(Path::new("")))
+}
+
+/// Checks that [`write_whole`] can create `path` or a file beside it: creates its temporary file
+/// and removes it.
+///
+/// # Errors
+/// As [`write_whole`].
+pub(crate) fn check_directory(path: &Path) -> io::Result<()> {
+    let (temporary, _) = create_beside(path)?;
+    fs::remove_file(temporary)
+}
+
+/// Checks that `path` is missing or not write-protected.
+///
+/// # Errors
+/// A file without write permission.
+pub(crate) fn check_replaceable(path: &Path) -> io::Result<()> {
+    match File::options().write(true).open(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        _ => Ok(()),
+    }
+}
+
+/// Creates the temporary file for `target`, with its permissions, and locks it.
+fn create_beside(target: &Path) -> io::Result<(PathBuf, File)> {
+    let temporary = temporary_beside(target)?;
+    // A process with the same id was killed here.
+    if is_abandoned(&temporary, std::process::id()) {
+        fs::remove_file(&temporary)?;
+    }
+    let mut options = File::options();
+    options.write(true).create_new(true);
+    #[cfg(unix)]
+    let file = {
+        use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+        let mode = |found: fs::Metadata| found.permissions().mode() & 0o777;
+        let wanted = fs::metadata(target).ok().map(mode);
+        let file = options.mode(wanted.unwrap_or(0o666)).open(&temporary)?;
+        if let Some(wanted) =
+            wanted.filter(|wanted| file.metadata().map(mode).ok() != Some(*wanted))
+        {
+            file.set_permissions(PermissionsExt::from_mode(wanted))?;
+        }
+        file
+    };
+    #[cfg(not(unix))]
+    let file = options.open(&temporary)?;
+    // Other processes see that the file is in use. Not every file system has locks.
+    let _ = file.try_lock();
+    Ok((temporary, file))
+}
+
+/// Removes the temporary files in `dir` that killed processes left of files with these names, or
+/// of all files. Those of living processes stay. A file that cannot be removed does no harm.
+pub fn remove_abandoned(dir: &Path, names: Option<&[OsString]>) {
+    let stems: Option<HashSet<OsString>> =
+        names.map(|names| names.iter().map(|name| hidden_stem(name)).collect());
+    let is_current = dir.as_os_str().is_empty();
+    let entries = fs::read_dir(if is_current { Path::new(".") } else { dir });
+    for entry in entries.into_iter().flatten().flatten() {
+        let hidden = entry.file_name();
+        if let Some((stem, process)) = parse_temporary(&hidden)
+            && stems.as_ref().is_none_or(|stems| stems.contains(stem))
+            && is_abandoned(&entry.path(), process)
+        {
+            let _ = fs::remove_file(entry.path());
+        }
+    }
+}
+
+/// Whether no process writes the temporary file of `process` any more. Writers hold a lock, which
+/// other computers see too on most network file systems.
+fn is_abandoned(temporary: &Path, process: u32) -> bool {
+    let Ok(found) = fs::symlink_metadata(temporary) else {
+        return false;
+    };
+    let other = process != std::process::id();
+    if !found.is_file() || other && Path::new("/proc").join(process.to_string()).exists() {
+        return false;
+    }
+    let Ok(file) = File::options().write(true).open(temporary) else {
+        return false;
+    };
+    match file.try_lock() {
+        Ok(()) => true,
+        Err(TryLockError::WouldBlock) => false,
+        Err(TryLockError::Error(_)) => {
+            let age = found.modified().ok().and_then(|at| at.elapsed().ok());
+            age.is_some_and(|age| age > ABANDONED)
+        }
+    }
 }
 
 /// Flushes the entries of a directory to the disk; without this, a crash may undo a rename.
@@ -64,8 +161,11 @@ pub fn sync_dir(dir: &Path) -> io::Result<()> {
 
 /// The file to replace: `path`, or the target of a symbolic link. A rename would replace a link, a
 /// FIFO, or the device `/dev/null` by a file.
-fn target_of(path: &Path) -> io::Result<PathBuf> {
+pub(crate) fn target_of(path: &Path) -> io::Result<PathBuf> {
     let refused = |why: &str| Err(io::Error::new(io::ErrorKind::InvalidInput, why));
+    if path.as_os_str().as_encoded_bytes().ends_with(b"/") {
+        return refused("the path names a directory; name a file");
+    }
     match fs::symlink_metadata(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(path.to_owned()),
         found => found?,
@@ -74,6 +174,7 @@ fn target_of(path: &Path) -> io::Result<PathBuf> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => {
             refused("a symbolic link without a target")
         }
+        Ok(target) if target.is_dir() => refused("is a directory; name a file"),
         Ok(target) if !fs::metadata(&target)?.is_file() => refused("not a regular file"),
         target => target,
     }
@@ -84,8 +185,24 @@ fn temporary_beside(path: &Path) -> io::Result<PathBuf> {
     let name = path
         .file_name()
         .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path names no file"))?;
-    let mut hidden = std::ffi::OsString::from(".");
-    hidden.push(name);
+    let mut hidden = hidden_stem(name);
     hidden.push(format!(".{}.tmp", std::process::id()));
     Ok(path.with_file_name(hidden))
+}
+
+/// `.NAME`.
+fn hidden_stem(name: &OsStr) -> OsString {
+    let mut hidden = OsString::from(".");
+    hidden.push(name);
+    hidden
+}
+
+/// `.NAME` and the process of `.NAME.PID.tmp`.
+fn parse_temporary(hidden: &OsStr) -> Option<(&OsStr, u32)> {
+    let hidden = Path::new(hidden);
+    let with_process = Path::new(hidden.file_stem()?);
+    let process = with_process.extension()?.to_str()?.parse().ok()?;
+    let stem = with_process.file_stem()?;
+    let is_hidden = stem.as_encoded_bytes().starts_with(b".");
+    (is_hidden && hidden.extension()? == "tmp").then_some((stem, process))
 }

@@ -38,6 +38,7 @@ pub mod layout;
 pub mod loader;
 mod moments;
 pub mod noise;
+pub mod output;
 mod parallel;
 pub mod patch;
 pub mod plane;

@@ -61,7 +61,8 @@ impl FromStr for Baseline {
 }
 
 impl Baseline {
-    fn path(&self, scene: &Scene) -> PathBuf {
+    /// The file with the image of `scene`.
+    pub fn path(&self, scene: &Scene) -> PathBuf {
         let stem = scene.path.file_stem().unwrap_or(OsStr::new(&scene.name));
         let mut file = stem.to_owned();
         file.push(".exr");

@@ -6,6 +6,7 @@ mod cli;
 use std::process::ExitCode;
 
 use clap::Parser;
+use demc_data::output::OutputError;
 
 #[global_allocator]
 static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;
@@ -16,7 +17,12 @@ fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            ExitCode::from(if error.is::<cli::UsageError>() { 2 } else { 1 })
+            let refused = error.downcast_ref().is_some_and(OutputError::is_usage);
+            ExitCode::from(if error.is::<cli::UsageError>() || refused {
+                2
+            } else {
+                1
+            })
         }
     }
 }

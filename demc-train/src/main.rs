@@ -5,6 +5,7 @@ mod cli;
 use std::process::ExitCode;
 
 use clap::Parser;
+use demc_data::output::OutputError;
 use demc_infer::compute::IsaError;
 use demc_infer::device::DeviceError;
 use demc_model::ops::within_pool;
@@ -20,10 +21,12 @@ fn main() -> ExitCode {
         Ok(code) => code,
         Err(error) => {
             eprintln!("error: {error:#}");
+            let refused = error.downcast_ref().is_some_and(OutputError::is_usage);
             let usage = error.is::<ConfigError>()
                 || error.is::<DeviceError>()
                 || error.is::<IsaError>()
-                || error.is::<UsageError>();
+                || error.is::<UsageError>()
+                || refused;
             ExitCode::from(if usage { 2 } else { 1 })
         }
     }

@@ -10,6 +10,7 @@ use demc_data::dataset::FORMAT;
 use demc_data::exr::ExrFile;
 use demc_data::frame::{Presence, check_open_header};
 use demc_data::layout::{MissingPolicies, detect};
+use demc_data::output::{Directories, Outputs};
 use demc_data::{ChannelLayout, Split, file};
 use glob::Pattern;
 use regex_lite::Regex;
@@ -34,15 +35,20 @@ pub fn run(args: &IndexArguments) -> Result<()> {
     let rules = Rules::of(args)?;
     let manifest = args.root.join("manifest.json");
     let exists = manifest.symlink_metadata().is_ok();
-    if exists && !args.overwrite {
-        let shown = manifest.display();
-        return Err(UsageError(format!("{shown} exists; --overwrite replaces it")).into());
+    let (files, ignored) = exr_files(&args.root)?;
+    let mut outputs = Outputs::default();
+    for file in &files {
+        outputs.protect(&args.root.join(file), &format!("scene {}", file.display()));
     }
+    if let Some(layout) = &args.layout {
+        outputs.protect(Path::new(layout), "the channel layout");
+    }
+    outputs.claim(&manifest, args.overwrite)?;
+    outputs.prepare(Directories::Expect)?;
     let mut before = match exists {
         true => Before::read(&manifest)?,
         false => Before::default(),
     };
-    let (files, ignored) = exr_files(&args.root)?;
     if files.is_empty() {
         bail!("{}: no EXR files in it or below", args.root.display());
     }

@@ -1,12 +1,12 @@
 //! `demc-data merge`.
 
 use std::ffi::OsString;
-use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Result;
 use demc_data::exr::ExrFile;
 use demc_data::exr::merge::{MergeInput, merge};
+use demc_data::output::{Directories, Outputs};
 
 use super::{MergeArguments, UsageError, printable};
 
@@ -22,7 +22,12 @@ pub fn run(args: &MergeArguments) -> Result<()> {
     let output = args.output.as_path();
     let files = args.files.iter();
     let sources: Vec<Source> = files.map(Source::parse).collect::<Result<_, _>>()?;
-    check_output(output, &sources, args.overwrite)?;
+    let mut outputs = Outputs::default();
+    for Source { path, .. } in &sources {
+        outputs.protect(path, &format!("the input {}", path.display()));
+    }
+    outputs.claim(output, args.overwrite)?;
+    outputs.prepare(Directories::Expect)?;
     let mut inputs = Vec::with_capacity(sources.len());
     for Source { prefix, path } in sources {
         let file = ExrFile::open(&path)?;
@@ -63,6 +68,14 @@ pub fn run(args: &MergeArguments) -> Result<()> {
 impl Source {
     /// Text before the first `=` is the name, unless it contains a path separator.
     fn parse(argument: &OsString) -> Result<Self, UsageError> {
+        let bytes = argument.as_encoded_bytes();
+        let start = bytes.iter().find(|byte| b"=/\\".contains(byte));
+        if argument.to_str().is_none() && start == Some(&b'=') {
+            let shown = printable(&argument.to_string_lossy());
+            return Err(UsageError(format!(
+                "{shown}: NAME=FILE must be UTF-8; rename the file"
+            )));
+        }
         let split = argument.to_str().and_then(|text| text.split_once('='));
         let Some((name, file)) = split.filter(|(name, _)| !name.contains(['/', '\\'])) else {
             return Ok(Self {
@@ -78,24 +91,6 @@ impl Source {
             prefix: Some(name.to_owned()),
             path: file.into(),
         })
-    }
-}
-
-fn check_output(output: &Path, sources: &[Source], overwrite: bool) -> Result<(), UsageError> {
-    let target = fs::canonicalize(output).ok();
-    let shown = output.display();
-    let is_target = |path: &Path| target.is_some() && fs::canonicalize(path).ok() == target;
-    if let Some(input) = sources.iter().find(|source| is_target(&source.path)) {
-        let input = input.path.display();
-        return Err(UsageError(format!(
-            "output {shown} would replace the input {input}"
-        )));
-    }
-    match target.is_some() && !overwrite {
-        true => Err(UsageError(format!(
-            "{shown} exists; --overwrite replaces it"
-        ))),
-        false => Ok(()),
     }
 }
 

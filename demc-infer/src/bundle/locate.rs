@@ -52,6 +52,37 @@ pub(super) fn locate(path: &Path) -> Result<PathBuf, BundleError> {
     Ok(checkpoint_weights(&checkpoint).unwrap_or_else(|| checkpoint.join(MODEL)))
 }
 
+/// Files of a run directory besides its checkpoints.
+const RUN_FILES: [&str; 8] = [
+    BEST,
+    LATEST,
+    "config.toml",
+    "layout.toml",
+    "run.json",
+    "metrics.jsonl",
+    "test.json",
+    "lock",
+];
+
+/// The files that belong to the model at `path`: itself, or those of its run or checkpoint
+/// directory. Some may be missing. Commands do not replace them.
+pub fn files(path: &Path) -> Vec<PathBuf> {
+    let mut files = vec![path.to_owned()];
+    files.extend(RUN_FILES.map(|name| path.join(name)));
+    let checkpoints = entries(&path.join(CHECKPOINTS));
+    files.extend(checkpoints.iter().flat_map(|dir| entries(dir)));
+    if checkpoint_weights(path).is_some() {
+        files.extend(entries(path));
+    }
+    files
+}
+
+/// The entries of a directory; none if it cannot be read.
+fn entries(dir: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(dir).into_iter().flatten().flatten();
+    entries.map(|entry| entry.path()).collect()
+}
+
 /// The weights of a checkpoint directory; `None` if `dir` is none.
 fn checkpoint_weights(dir: &Path) -> Option<PathBuf> {
     let mut files = [AVERAGE, MODEL].map(|file| dir.join(file)).into_iter();

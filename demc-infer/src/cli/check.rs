@@ -15,7 +15,7 @@ use serde::Serialize;
 use super::flags::{DeviceFlag, ModelFlag};
 use super::inputs::{Frames, Inputs};
 use super::layouts::{LayoutFlags, Layouts, say};
-use super::{Clamped, print};
+use super::{Clamped, print, utf8_for_json};
 
 /// Compare images with a model's training data: statistics of each channel, and warnings.
 ///
@@ -69,6 +69,12 @@ impl Arguments {
     /// Checks every image; an unreadable one ends the run.
     pub fn run(self) -> anyhow::Result<()> {
         let inputs = Inputs::expand(&self.inputs, self.frames)?;
+        if self.json {
+            inputs
+                .files
+                .iter()
+                .try_for_each(|file| utf8_for_json(file))?;
+        }
         let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
         let mut all = Vec::with_capacity(inputs.files.len());

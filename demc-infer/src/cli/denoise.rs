@@ -1,14 +1,13 @@
 //! `demc-infer denoise`: denoises EXR files one after another.
 
-use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::Context;
 use clap::{Args, ValueEnum};
 use demc_data::ChannelLayout;
 use demc_data::exr::rewrite::{OutputChannels, WriteOptions, rewrite};
 use demc_data::exr::{Compression, ExrFile};
 use demc_data::frame::{decode_input, decode_repaired};
+use demc_data::output::{Directories, Outputs};
 use demc_infer::denoise::{DenoiseOptions, SeamError};
 use demc_infer::guard::{EnergyBias, Warning};
 use demc_infer::{Bundle, Picture, memory};
@@ -69,7 +68,7 @@ pub struct Arguments {
     /// image with NaN or infinite samples is refused, and negative radiance counts as 0
     #[arg(long)]
     repair: bool,
-    /// Replace existing outputs. Inputs are never replaced
+    /// Replace existing outputs and previews. Inputs are never replaced
     #[arg(long)]
     overwrite: bool,
     /// Only these frames of sequences
@@ -77,7 +76,7 @@ pub struct Arguments {
     frames: Option<Frames>,
     #[command(flatten)]
     output_flags: OutputFlags,
-    /// Also write a preview NAME.png beside each output: clip(2^EXPOSURE x, 0, 1)^(1/2.2)
+    /// Also write a preview NAME.png beside each output, unless it exists: clip(2^EXPOSURE x, 0, 1)^(1/2.2)
     #[arg(long)]
     png: bool,
     /// Exposure of previews in stops
@@ -103,20 +102,28 @@ pub struct Arguments {
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let inputs = Inputs::expand(&self.inputs, self.frames)?;
-        let mut jobs = Jobs::new(&inputs, &self.output)?;
+        let mut jobs = Jobs::new(&inputs, &self.output, self.png)?;
+        let mut outputs = Outputs::default();
+        self.model.protect(&mut outputs);
+        self.layout.protect(&mut outputs);
+        jobs.claim(&mut outputs, self.overwrite)?;
         if !self.overwrite {
-            jobs.skip_done(self.png)?;
+            jobs.skip_done(&mut outputs);
         }
         if jobs.skipped > 0 {
             let (done, all) = (jobs.skipped, jobs.skipped + jobs.list.len());
             eprintln!("note: {done} of {all} images already exist; --overwrite replaces them");
         }
+        if jobs.kept_previews > 0 {
+            let kept = jobs.kept_previews;
+            eprintln!("note: existing previews are kept: {kept}; --overwrite replaces them");
+        }
         let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
-        if jobs.directory {
-            fs::create_dir_all(&self.output)
-                .with_context(|| format!("cannot create {}", self.output.display()))?;
-        }
+        outputs.prepare(match jobs.directory {
+            true => Directories::Create,
+            false => Directories::Expect,
+        })?;
         let jobs = jobs.list;
         let progress = Progress::new(jobs.len());
         let mut scales = SequenceScales::new(&inputs.sequences);
@@ -216,17 +223,19 @@ impl Arguments {
             .warning()
             .iter()
             .for_each(warn);
-        // The preview comes first, because an existing output counts as finished.
-        if self.png {
+        if let Some(path) = &job.preview {
             let exposed: Vec<f32> = image.iter().map(|x| x * self.exposure.exp2()).collect();
-            let path = job.preview();
-            Picture::from_hdr(&exposed, frame.height, frame.width)
-                .write_png(&path)
-                .with_context(|| format!("cannot write {}", path.display()))?;
+            Picture::from_hdr(&exposed, frame.height, frame.width).write_png(path)?;
         }
+        let Some(output) = &job.output else {
+            return Ok(frame.clamped);
+        };
         let mut planes = denoised.color_hdr;
         planes.extend(denoised.alpha.into_iter().flatten());
-        for note in self.output_flags.write(&mut file, job, layout, &planes)? {
+        for note in self
+            .output_flags
+            .write(&mut file, output, layout, &planes)?
+        {
             progress.line(format_args!("note: {name}: {note}"));
         }
         Ok(frame.clamped)
@@ -258,12 +267,12 @@ enum OutputPrecision {
 }
 
 impl OutputFlags {
-    /// Writes the job's output: `input` with the denoised colour. Returns notes about other
+    /// Writes `output`: `input` with the denoised colour. Returns notes about other
     /// differences from the input.
     fn write(
         &self,
         input: &mut ExrFile,
-        job: &Job,
+        output: &Path,
         layout: &ChannelLayout,
         color_hdr: &[f32],
     ) -> Result<Vec<String>, demc_data::Error> {
@@ -278,7 +287,7 @@ impl OutputFlags {
             }),
             compression: self.compression,
         };
-        let written = rewrite(input, layout, color_hdr, &job.output, &options)?;
+        let written = rewrite(input, layout, color_hdr, output, &options)?;
         let mut notes: Vec<String> = written.changes.iter().map(ToString::to_string).collect();
         if written.clamped > 0 {
             let clamped = written.clamped;

@@ -48,6 +48,9 @@ struct ScoresJson<'a> {
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let more = find_metrics(&self.metrics)?;
+        if let Some(path) = self.json.as_deref().filter(|path| *path != Path::new("-")) {
+            self.scenes.check_output(path)?;
+        }
         let report = self.scenes.score(|_, _| Ok(()), |(), _| Ok(()))?;
         // The table comes first, so that a failed write does not lose it.
         if self.json.as_deref() != Some(Path::new("-")) {

@@ -6,11 +6,14 @@ use std::path::{Path, PathBuf};
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
 use demc_data::ChannelLayout;
+use demc_data::output::Outputs;
+use demc_infer::bundle::locate;
 use demc_infer::verify::{Runtime, TOLERANCE, verify};
 use demc_infer::{Bundle, BundleFile, Names, Precision};
 
 use super::flags::ModelFlag;
-use super::{UsageError, not_an_input, print};
+use super::layouts::LAYOUT;
+use super::{UsageError, check_output, print};
 
 /// Variable with the interpreter for `--verify`.
 const PYTHON_VARIABLE: &str = "DEMC_PYTHON";
@@ -86,19 +89,23 @@ enum PrecisionFlag {
 
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
-        let file = self.model.read()?;
         // Rounding to f16 cannot be undone, so an export must not replace its model.
-        let mut inputs = vec![(file.path.as_path(), "the model")];
-        let filter = match &self.albedo_filter {
-            Some(path) if path != Path::new(NO_FILTER) => Some(BundleFile::read(path)?),
-            _ => None,
-        };
-        inputs.extend(
-            filter
-                .as_ref()
-                .map(|file| (&*file.path, "the albedo filter")),
-        );
-        not_an_input(&self.output, &inputs)?;
+        let mut outputs = Outputs::default();
+        self.model.protect(&mut outputs);
+        let filter = self.albedo_filter.as_deref();
+        let filter = filter.filter(|path| *path != Path::new(NO_FILTER));
+        for file in filter.iter().flat_map(|path| locate::files(path)) {
+            outputs.protect(&file, "the albedo filter");
+        }
+        if let Some(layout) = &self.layout {
+            outputs.protect(Path::new(layout), LAYOUT);
+        }
+        if let Some(python) = &self.python {
+            outputs.protect(python, "the Python interpreter");
+        }
+        check_output(outputs, &self.output)?;
+        let file = self.model.read()?;
+        let filter = filter.map(BundleFile::read).transpose()?;
         let names = match self.names {
             NamesFlag::Burn => Names::Burn,
             NamesFlag::Torch => Names::Torch,

@@ -3,6 +3,8 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use demc_data::output::Outputs;
+use demc_infer::bundle::locate;
 use demc_infer::compute::ComputeFlags;
 use demc_infer::tiles::EXACT_HALO;
 use demc_infer::{Bundle, BundleError, BundleFile, Ensemble, Tiles, Tiling, device};
@@ -28,6 +30,13 @@ impl ModelFlag {
         match &self.path {
             Some(path) => path.display().to_string(),
             None => BUNDLED_MODEL_NAME.into(),
+        }
+    }
+
+    /// Protects the model's files from being replaced.
+    pub fn protect(&self, outputs: &mut Outputs) {
+        for file in self.path.iter().flat_map(|path| locate::files(path)) {
+            outputs.protect(&file, "the model");
         }
     }
 

@@ -4,9 +4,11 @@ use std::path::PathBuf;
 
 use burn::tensor::Device;
 use clap::Args;
+use demc_data::output::Outputs;
+use demc_infer::bundle::locate;
 use demc_infer::{BundleError, BundleFile, Names, Precision};
 
-use super::{not_an_input, print};
+use super::{check_output, print};
 
 /// Import weights that were trained in PyTorch with the package of python/.
 ///
@@ -33,15 +35,16 @@ pub struct Arguments {
 
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
+        let mut outputs = Outputs::default();
+        outputs.protect(&self.weights, "the weights");
+        for file in self.like.iter().flat_map(|like| locate::files(like)) {
+            outputs.protect(&file, "the model");
+        }
+        check_output(outputs, &self.output)?;
         let like = match &self.like {
             Some(path) => Some(BundleFile::read(path)?),
             None => None,
         };
-        let mut inputs = vec![(self.weights.as_path(), "the weights")];
-        if let Some(like) = &like {
-            inputs.push((&like.path, "the model"));
-        }
-        not_an_input(&self.output, &inputs)?;
         let known = like.is_some();
         let file = match BundleFile::import(&self.weights, like) {
             Err(error @ BundleError::Foreign { .. }) if !known => {

@@ -128,13 +128,19 @@ fn is_exr(path: &Path) -> bool {
 }
 
 fn is_pattern(path: &Path) -> bool {
-    path.to_string_lossy().contains(['*', '?', '['])
+    let bytes = path.as_os_str().as_encoded_bytes();
+    bytes.iter().any(|byte| b"*?[".contains(byte))
 }
 
 fn pattern(argument: &Path) -> Result<Vec<PathBuf>, UsageError> {
     let error =
         |error: &dyn std::fmt::Display| UsageError(format!("{}: {error}", argument.display()));
-    let found = glob::glob(&argument.to_string_lossy()).map_err(|source| error(&source))?;
+    let Some(text) = argument.to_str() else {
+        return Err(error(
+            &"a pattern must be UTF-8; name the directory instead",
+        ));
+    };
+    let found = glob::glob(text).map_err(|source| error(&source))?;
     let mut files = Vec::new();
     for path in found {
         let path = path.map_err(|source| error(&source))?;

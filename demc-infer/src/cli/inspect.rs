@@ -12,7 +12,7 @@ use demc_infer::{Bundle, BundleMeta, Names, Precision};
 use serde::Serialize;
 
 use super::flags::ModelFlag;
-use super::print;
+use super::{print, utf8_for_json};
 
 /// Show a model: network, training step, statistics and input channels.
 ///
@@ -57,6 +57,9 @@ impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let source = self.model.read()?;
         let (file, names, precision) = (source.path.clone(), source.names, source.precision);
+        if self.json {
+            utf8_for_json(&file)?;
+        }
         let bundle = source.into_bundle(&Device::flex())?;
         let tensors = match self.tensors {
             true => bundle.tensors(names),

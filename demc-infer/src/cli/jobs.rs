@@ -5,6 +5,8 @@ use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use demc_data::output::{OutputError, Outputs};
+
 use super::UsageError;
 use super::inputs::Inputs;
 
@@ -12,21 +14,10 @@ use super::inputs::Inputs;
 #[derive(Debug, PartialEq)]
 pub struct Job {
     pub input: PathBuf,
-    pub output: PathBuf,
-}
-
-impl Job {
-    pub fn preview(&self) -> PathBuf {
-        self.output.with_extension("png")
-    }
-
-    fn is_done(&self) -> bool {
-        let modified = |path: &Path| fs::metadata(path).and_then(|found| found.modified());
-        match (modified(&self.input), modified(&self.output)) {
-            (Ok(input), Ok(output)) => input <= output,
-            (_, output) => output.is_ok(),
-        }
-    }
+    /// The file to write; `None` if it is finished.
+    pub output: Option<PathBuf>,
+    /// The preview to write; `None` if there is to be none, or one exists.
+    pub preview: Option<PathBuf>,
 }
 
 /// All images of a command line.
@@ -37,14 +28,17 @@ pub struct Jobs {
     pub directory: bool,
     /// Number of finished images, which are not in the list.
     pub skipped: usize,
+    /// Number of previews that exist without their image, and are kept.
+    pub kept_previews: usize,
 }
 
 impl Jobs {
-    /// Chooses an output for each input, before anything is read.
+    /// Chooses an output for each input, with a preview if `previews` is set, before anything is
+    /// read.
     ///
     /// # Errors
-    /// Two inputs with the same output, or an output that is an input.
-    pub fn new(inputs: &Inputs, output: &Path) -> Result<Self, UsageError> {
+    /// Two inputs with the same output; several for one file.
+    pub fn new(inputs: &Inputs, output: &Path, previews: bool) -> Result<Self, UsageError> {
         let named_as_directory = output
             .as_os_str()
             .to_string_lossy()
@@ -77,48 +71,63 @@ impl Jobs {
             };
             list.push(Job {
                 input: input.clone(),
-                output,
+                preview: previews.then(|| output.with_extension("png")),
+                output: Some(output),
             });
-        }
-        let originals: Vec<_> = inputs
-            .files
-            .iter()
-            .filter_map(|input| fs::canonicalize(input).ok())
-            .collect();
-        for job in &list {
-            if fs::canonicalize(&job.output).is_ok_and(|output| originals.contains(&output)) {
-                return Err(UsageError(format!(
-                    "output {} would replace an input",
-                    job.output.display()
-                )));
-            }
         }
         Ok(Self {
             list,
             directory,
             skipped: 0,
+            kept_previews: 0,
         })
     }
 
-    /// Removes finished images from the list. Outputs are written atomically, so an existing output
-    /// is finished, unless its input is newer. With `previews`, its preview must exist, too.
+    /// Notes all files to write. In a directory, existing ones are skipped later.
     ///
     /// # Errors
-    /// The only output exists, so there is nothing to do.
-    pub fn skip_done(&mut self, previews: bool) -> Result<(), UsageError> {
-        if let (false, [job]) = (self.directory, &self.list[..])
-            && job.output.exists()
-        {
-            let output = job.output.display();
-            return Err(UsageError(format!(
-                "{output} exists; --overwrite replaces it"
-            )));
+    /// An output or preview that is an input or another output; without `overwrite`, an existing
+    /// file, unless the outputs go to a directory.
+    pub fn claim(&self, outputs: &mut Outputs, overwrite: bool) -> Result<(), OutputError> {
+        for job in &self.list {
+            let what = format!("the input {}", job.input.display());
+            outputs.protect(&job.input, &what);
         }
+        let mut files = self
+            .list
+            .iter()
+            .flat_map(|job| job.output.iter().chain(&job.preview));
+        files.try_for_each(|file| outputs.claim(file, overwrite || self.directory))
+    }
+
+    /// Removes what exists in the output directory, also from `outputs`. Files are written atomically, so an existing
+    /// output is finished, unless its input is newer. Then its preview is written again, too.
+    pub fn skip_done(&mut self, outputs: &mut Outputs) {
         let before = self.list.len();
+        for Job {
+            input,
+            output,
+            preview,
+        } in &mut self.list
+        {
+            let modified = |path: &Path| fs::metadata(path).and_then(|found| found.modified());
+            let made = output.as_deref().map(modified);
+            if let Some(Ok(made)) = made
+                && modified(input).is_ok_and(|changed| changed > made)
+            {
+                continue;
+            }
+            let mut take = |file: &mut Option<PathBuf>| {
+                let existing = file.take_if(|file| file.exists());
+                existing.inspect(|file| outputs.release(file))
+            };
+            take(output);
+            let kept = take(preview);
+            self.kept_previews += usize::from(kept.is_some() && output.is_some());
+        }
         self.list
-            .retain(|job| !job.is_done() || previews && !job.preview().exists());
+            .retain(|job| job.output.is_some() || job.preview.is_some());
         self.skipped += before - self.list.len();
-        Ok(())
     }
 }
 
@@ -126,7 +135,7 @@ impl Jobs {
 mod tests {
     use super::*;
 
-    fn jobs(files: Vec<PathBuf>, output: &Path) -> Result<Jobs, UsageError> {
+    fn jobs(files: Vec<PathBuf>, output: &Path, previews: bool) -> Result<Jobs, UsageError> {
         let several = files.len() > 1;
         let sequences = Vec::new();
         let inputs = Inputs {
@@ -134,13 +143,20 @@ mod tests {
             several,
             sequences,
         };
-        Jobs::new(&inputs, output)
+        Jobs::new(&inputs, output, previews)
     }
 
     fn outputs(inputs: &[&str], output: &str) -> Result<Vec<PathBuf>, String> {
         let files = inputs.iter().map(PathBuf::from).collect();
-        let jobs = jobs(files, Path::new(output)).map_err(|error| error.to_string())?;
-        Ok(jobs.list.into_iter().map(|job| job.output).collect())
+        let jobs = jobs(files, Path::new(output), false).map_err(|error| error.to_string())?;
+        let outputs = jobs.list.into_iter().filter_map(|job| job.output);
+        Ok(outputs.collect())
+    }
+
+    /// The error of claiming the files of a job list.
+    fn refusal(jobs: &Jobs) -> String {
+        let claimed = jobs.claim(&mut Outputs::default(), false);
+        claimed.expect_err("refused").to_string()
     }
 
     #[test]
@@ -163,15 +179,22 @@ mod tests {
     #[test]
     fn an_input_is_never_replaced() -> std::io::Result<()> {
         let dir = tempfile::tempdir()?;
-        let input = dir.path().join("a.exr");
+        let [input, picture] = ["a.exr", "pin.png"].map(|name| dir.path().join(name));
         fs::write(&input, "")?;
-        for output in [&input, dir.path()] {
-            let error = jobs(vec![input.clone()], output).expect_err("input");
-            assert!(
-                error.to_string().ends_with("would replace an input"),
-                "{error}"
-            );
+        fs::write(&picture, "")?;
+        let out = dir.path().join("pin.exr");
+        for (input, output) in [
+            (&input, input.as_path()),
+            (&input, dir.path()),
+            (&picture, &out),
+        ] {
+            let jobs = jobs(vec![input.clone()], output, true).expect("a job");
+            let error = refusal(&jobs);
+            assert!(error.contains("would replace the input"), "{error}");
         }
+        let jobs = jobs(vec![input], &dir.path().join("both.png"), true).expect("a job");
+        let error = refusal(&jobs);
+        assert!(error.contains("would be written twice"), "{error}");
         Ok(())
     }
 
@@ -182,10 +205,12 @@ mod tests {
         fs::create_dir(&out)?;
         fs::write(&input, "")?;
         fs::write(out.join("a.exr"), "")?;
+        fs::write(out.join("a.png"), "")?;
         let left = || {
-            let mut jobs = jobs(vec![input.clone()], &out).expect("a job");
-            jobs.skip_done(false).expect("a directory");
-            jobs.list.len()
+            let mut jobs = jobs(vec![input.clone()], &out, true).expect("a job");
+            jobs.skip_done(&mut Outputs::default());
+            let files = |job: Job| job.output.into_iter().chain(job.preview);
+            jobs.list.into_iter().flat_map(files).count()
         };
         assert_eq!(left(), 0);
         let later = std::time::SystemTime::now() + std::time::Duration::from_secs(60);
@@ -193,7 +218,7 @@ mod tests {
             .write(true)
             .open(&input)?
             .set_modified(later)?;
-        assert_eq!(left(), 1);
+        assert_eq!(left(), 2);
         Ok(())
     }
 
@@ -201,7 +226,9 @@ mod tests {
     fn a_file_cannot_take_several_images() -> std::io::Result<()> {
         let file = tempfile::NamedTempFile::new()?;
         let inputs = vec!["a.exr".into(), "b.exr".into()];
-        let error = jobs(inputs, file.path()).expect_err("file").to_string();
+        let error = jobs(inputs, file.path(), false)
+            .expect_err("file")
+            .to_string();
         assert!(
             error.ends_with("is a file; 2 input(s) need a directory"),
             "{error}"
@@ -210,24 +237,30 @@ mod tests {
     }
 
     #[test]
-    fn an_existing_output_is_skipped_in_a_directory_and_an_error_alone() -> std::io::Result<()> {
+    fn an_existing_file_is_skipped_in_a_directory_and_an_error_alone() -> std::io::Result<()> {
         let dir = tempfile::tempdir()?;
-        fs::write(dir.path().join("a.exr"), "")?;
-        let inputs = || vec!["x/a.exr".into(), "x/b.exr".into()];
-        let mut several = jobs(inputs(), dir.path()).expect("jobs");
-        several.skip_done(false).expect("one is left");
-        assert_eq!((several.skipped, several.list.len()), (1, 1));
-        fs::write(dir.path().join("b.exr"), "")?;
-        fs::write(dir.path().join("b.png"), "")?;
-        let mut previews = jobs(inputs(), dir.path()).expect("jobs");
-        previews.skip_done(true).expect("a.png is missing");
-        assert_eq!((previews.skipped, previews.list.len()), (1, 1));
-        let mut alone = jobs(vec!["x/a.exr".into()], &dir.path().join("a.exr")).expect("a job");
-        let error = alone.skip_done(false).expect_err("it exists").to_string();
-        assert!(
-            error.ends_with("a.exr exists; --overwrite replaces it"),
-            "{error}"
-        );
+        let at = |name: &str| dir.path().join(name);
+        for name in ["a.exr", "b.exr", "b.png", "c.png"] {
+            fs::write(at(name), "")?;
+        }
+        let inputs = || ["x/a.exr", "x/b.exr", "x/c.exr"].map(PathBuf::from).into();
+        let mut several = jobs(inputs(), dir.path(), false).expect("jobs");
+        several.skip_done(&mut Outputs::default());
+        assert_eq!((several.skipped, several.list.len()), (2, 1));
+        let mut previews = jobs(inputs(), dir.path(), true).expect("jobs");
+        previews.skip_done(&mut Outputs::default());
+        let [a, c] = &previews.list[..] else {
+            panic!("{previews:?}")
+        };
+        assert_eq!((&a.output, &a.preview), (&None, &Some(at("a.png"))));
+        assert_eq!((&c.output, &c.preview), (&Some(at("c.exr")), &None));
+        assert_eq!(previews.kept_previews, 1);
+        for (output, exists) in [("a.exr", "a.exr"), ("c.exr", "c.png")] {
+            let alone = jobs(vec!["x/a.exr".into()], &at(output), true).expect("a job");
+            let error = refusal(&alone);
+            let end = format!("{exists} exists; --overwrite replaces it");
+            assert!(error.ends_with(&end), "{error}");
+        }
         Ok(())
     }
 }

@@ -6,10 +6,14 @@ use std::path::Path;
 use clap::Args;
 use demc_data::exr::ExrFile;
 use demc_data::layout::{FileLayout, Missing, detect};
+use demc_data::output::Outputs;
 use demc_data::{ChannelLayout, Dataset, Error};
 use demc_infer::Bundle;
 
 use super::UsageError;
+
+/// What a layout file is called in messages about outputs.
+pub const LAYOUT: &str = "the channel layout";
 
 /// `--layout`, `--layer`.
 #[derive(Args)]
@@ -33,6 +37,13 @@ pub struct Layouts<'a> {
 }
 
 impl LayoutFlags {
+    /// Protects the file of `--layout` from being replaced.
+    pub fn protect(&self, outputs: &mut Outputs) {
+        if let Some(layout) = &self.layout {
+            outputs.protect(Path::new(layout), LAYOUT);
+        }
+    }
+
     /// Reads the layout of `--layout`.
     ///
     /// # Errors

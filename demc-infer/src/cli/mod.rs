@@ -20,10 +20,10 @@ mod report;
 mod scenes;
 mod warnings;
 
-use std::fs;
 use std::path::Path;
 
 use clap::{Parser, Subcommand};
+use demc_data::output::{Directories, OutputError, Outputs};
 
 /// Use a trained DEMC network: denoise and score renderings, export and import weights.
 #[derive(Parser)]
@@ -90,19 +90,21 @@ impl Clamped {
     }
 }
 
-/// Refuses an output that would replace an input. `inputs` are files and their names in the
-/// message.
-fn not_an_input(output: &Path, inputs: &[(&Path, &str)]) -> Result<(), UsageError> {
-    let Ok(target) = fs::canonicalize(output) else {
-        return Ok(());
-    };
-    for (input, name) in inputs {
-        if fs::canonicalize(input).is_ok_and(|input| input == target) {
-            let output = output.display();
-            return Err(UsageError(format!("output {output} would replace {name}")));
-        }
+/// Checks the only output of a command, which may replace a file, but no input.
+fn check_output(mut outputs: Outputs, path: &Path) -> Result<(), OutputError> {
+    outputs.claim(path, true)?;
+    outputs.prepare(Directories::Expect)
+}
+
+/// Fails for a path that JSON cannot hold.
+fn utf8_for_json(path: &Path) -> Result<(), UsageError> {
+    match path.to_str() {
+        Some(_) => Ok(()),
+        None => Err(UsageError(format!(
+            "{}: not UTF-8, as JSON requires; rename it or omit --json",
+            path.display()
+        ))),
     }
-    Ok(())
 }
 
 /// Writes `text` and a newline to stdout if `path` is `-`, otherwise to a file.

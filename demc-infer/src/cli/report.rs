@@ -28,6 +28,7 @@ pub struct Arguments {
 
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
+        self.scenes.check_output(&self.output)?;
         let mut page = ReportPage::default();
         let report = self.scenes.score(
             |images, scenes| Ok(images.encode(scenes)?),

@@ -1,8 +1,9 @@
 //! Flags and scoring shared by the commands that score a data set.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
+use demc_data::output::Outputs;
 use demc_data::{Dataset, Rgb, Scene};
 use demc_infer::denoise::DenoiseOptions;
 use demc_infer::report::SceneImages;
@@ -62,6 +63,25 @@ impl Scenes {
             Ensemble::One => name,
             passes => format!("{name}, mean of {} passes", passes.count()),
         }
+    }
+
+    /// Checks the command's output before anything is scored.
+    ///
+    /// # Errors
+    /// An output that is an input or cannot be written; no data set.
+    pub fn check_output(&self, path: &Path) -> anyhow::Result<()> {
+        let mut outputs = Outputs::default();
+        self.model.protect(&mut outputs);
+        self.layout.protect(&mut outputs);
+        outputs.protect_dataset(&self.data)?;
+        let scenes = Dataset::list(&self.data)?;
+        for baseline in &self.baselines {
+            let what = format!("an image of baseline {}", baseline.name);
+            for scene in &scenes {
+                outputs.protect(&baseline.path(scene), &what);
+            }
+        }
+        Ok(super::check_output(outputs, path)?)
     }
 
     /// Scores every scene of the split in all metrics, with one scene in memory at a time.

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Args;
+use demc_train::config::utf8;
 use demc_train::record::progress::say;
 use demc_train::tools::ablation::spec::AblationSpec;
 use demc_train::tools::ablation::{self, AblationOutcome};
@@ -37,7 +38,7 @@ pub struct Arguments {
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let mut spec = AblationSpec::load(&arguments.config, &arguments.set)?;
     if let Some(dir) = arguments.run_dir {
-        spec.dir = dir;
+        spec.dir = utf8("--run-dir", &dir)?.into();
     }
     let device = arguments.compute.device()?;
     for variant in &spec.variants {

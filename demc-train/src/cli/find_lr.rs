@@ -4,9 +4,12 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
+use demc_data::output::{Directories, Outputs};
 use demc_train::config::Config;
 use demc_train::record::progress::{StepProgress, say};
 use demc_train::run::data::RunData;
+use demc_train::run::inputs;
+use demc_train::tools::chart::with_extension;
 use demc_train::tools::find_lr::{RateRange, sweep};
 use demc_train::usage::UsageError;
 
@@ -73,6 +76,17 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         .into());
     }
     let config = Config::load(&arguments.config, &arguments.set)?;
+    let name = arguments.config.file_stem().unwrap_or_default();
+    let stem = arguments
+        .out
+        .unwrap_or_else(|| Path::new("runs/find-lr").join(name));
+    let mut outputs = Outputs::default();
+    let file = std::slice::from_ref(&arguments.config);
+    inputs::protect(&mut outputs, file, &config)?;
+    for extension in ["csv", "svg"] {
+        outputs.claim(&with_extension(&stem, extension)?, true)?;
+    }
+    outputs.prepare(Directories::Create)?;
     let device = arguments.compute.device()?;
     let data = RunData::open(&config)?;
     for warning in &data.warnings {
@@ -83,10 +97,6 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         data.summary(),
         config.data.root.display()
     ));
-    let name = arguments.config.file_stem().unwrap_or_default();
-    let stem = arguments
-        .out
-        .unwrap_or_else(|| Path::new("runs/find-lr").join(name));
     let per_step = config.patches_per_step();
     let progress = StepProgress::new(0, steps as u64, per_step, data.train.len());
     let mut done = 0;

@@ -4,7 +4,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Args;
+use demc_data::output::{Directories, Outputs};
+use demc_infer::bundle::locate;
 use demc_train::record::progress::say;
+use demc_train::tools::chart::with_extension;
 use demc_train::tools::plot::{PlotOptions, plot};
 
 /// Draw loss and validation curves of one or more runs as SVG
@@ -39,6 +42,12 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         linear,
     } = arguments;
     let stem = out.unwrap_or_else(|| runs[0].join("curves"));
+    let mut outputs = Outputs::default();
+    for file in runs.iter().flat_map(|run| locate::files(run)) {
+        outputs.protect(&file, "a file of a run");
+    }
+    outputs.claim(&with_extension(&stem, "svg")?, true)?;
+    outputs.prepare(Directories::Expect)?;
     let drawn = plot(&runs, &stem, &PlotOptions { smooth, linear })?;
     for note in drawn.notes {
         say(format!("note: {note}"));

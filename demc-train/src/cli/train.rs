@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
-use demc_train::config::{Config, ConfigError};
+use demc_train::config::{Config, ConfigError, utf8};
 use demc_train::record::progress::say;
 use demc_train::run::run_dir::{CONFIG, copy_in_checkpoint};
 use demc_train::run::session::{Session, SessionOptions, SessionOutcome};
@@ -42,9 +42,9 @@ pub struct Arguments {
 }
 
 /// The edit that sets the run directory.
-fn run_dir_set(dir: &Path) -> String {
-    let dir = toml::Value::String(dir.to_string_lossy().into_owned());
-    format!("run.dir={dir}")
+fn run_dir_set(dir: &Path) -> Result<String, ConfigError> {
+    let dir = toml::Value::String(utf8("--run-dir", dir)?.to_owned());
+    Ok(format!("run.dir={dir}"))
 }
 
 /// Adds where an intact copy of a run's own configuration is.
@@ -64,9 +64,11 @@ fn with_copy(error: ConfigError, config: &Path) -> ConfigError {
 /// Trains a run, new or resumed.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let mut sets = arguments.set;
-    sets.extend(arguments.run_dir.as_deref().map(run_dir_set));
-    let config = arguments.config.expect("clap requires it");
-    let config = Config::load(&config, &sets).map_err(|error| with_copy(error, &config))?;
+    if let Some(dir) = &arguments.run_dir {
+        sets.push(run_dir_set(dir)?);
+    }
+    let file = arguments.config.expect("clap requires it");
+    let config = Config::load(&file, &sets).map_err(|error| with_copy(error, &file))?;
     let device = arguments.compute.device()?;
     let options = SessionOptions {
         resume: arguments.resume,
@@ -74,6 +76,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     };
     let (root, dir) = (config.data.root.clone(), config.run_dir().to_path_buf());
     let session = Session::open(config, options, &device, &arguments.compute.device)?;
+    session.check_outputs(&[file])?;
     say(format!("demc-train: {}", session.headline()));
     say(format!("\n{}", session.run().config().to_toml()));
     say(format!("data: {} in {}", session.data, root.display()));

@@ -91,6 +91,9 @@ impl Config {
         let default_dir = || Path::new("runs").join(path.file_stem().unwrap_or_default());
         config.run.dir.get_or_insert_with(default_dir);
         config.make_absolute().map_err(read_error)?;
+        for (key, file) in config.paths() {
+            utf8(key, file)?;
+        }
         Ok(config)
     }
 
@@ -151,6 +154,14 @@ impl Config {
         values
     }
 
+    /// The paths by key.
+    fn paths(&self) -> impl Iterator<Item = (&'static str, &Path)> {
+        let optional = [("run.dir", &self.run.dir), ("train.init", &self.train.init)];
+        let optional = optional.into_iter();
+        let set = optional.filter_map(|(key, path)| Some((key, path.as_deref()?)));
+        set.chain([("data.root", self.data.root.as_path())])
+    }
+
     fn make_absolute(&mut self) -> io::Result<()> {
         self.data.root = std::path::absolute(&self.data.root)?;
         for path in [&mut self.run.dir, &mut self.train.init]
@@ -160,8 +171,10 @@ impl Config {
             *path = std::path::absolute(&*path)?;
         }
         if self.data.layout.ends_with(".toml") {
-            let layout = std::path::absolute(&self.data.layout)?;
-            self.data.layout = layout.to_string_lossy().into_owned();
+            // Without UTF-8 in the current directory, the relative path stays.
+            if let Some(layout) = std::path::absolute(&self.data.layout)?.to_str() {
+                self.data.layout = layout.to_owned();
+            }
         }
         Ok(())
     }
@@ -260,6 +273,19 @@ impl Config {
             })
             .collect()
     }
+}
+
+/// The text of the path of `key`.
+///
+/// # Errors
+/// A path that TOML cannot hold.
+pub fn utf8<'a>(key: &str, path: &'a Path) -> Result<&'a str, ConfigError> {
+    path.to_str().ok_or_else(|| {
+        let shown = path.display();
+        ConfigError::Source(format!(
+            "{key}: {shown}: not UTF-8, as a configuration requires; rename it or choose another"
+        ))
+    })
 }
 
 fn read_text(path: &Path) -> io::Result<String> {

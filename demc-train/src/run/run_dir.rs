@@ -17,7 +17,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
 use demc_data::ChannelLayout;
-use demc_data::file::write_whole;
+use demc_data::file::{remove_abandoned, write_whole};
+use demc_infer::bundle::locate::{BEST, LATEST};
 
 use crate::config::Config;
 use crate::record::metrics_log::MetricsLog;
@@ -36,10 +37,19 @@ const LAYOUT: &str = "layout.toml";
 const LOCK: &str = "lock";
 /// Files that describe the run, copied into its checkpoints.
 pub const OWN_FILES: [&str; 3] = [CONFIG, RUN, LAYOUT];
-/// Suffix of a hidden file that was not written completely.
-const TEMPORARY: &str = ".tmp";
+/// Scores of the test split.
+pub const SCORES: &str = "test.json";
 /// Files that show that a directory contains a run.
-const TRACES: [&str; 4] = [RUN, METRICS, "checkpoints", "latest"];
+const TRACES: [&str; 4] = [RUN, METRICS, "checkpoints", LATEST];
+
+/// The files in `dir` that a run replaces if they exist.
+pub fn replaced_files(dir: &Path) -> Vec<PathBuf> {
+    let mut names = vec![METRICS, LATEST, BEST, SCORES, "strips/test.png"];
+    if !dir.join(CONFIG).exists() {
+        names.push(LAYOUT);
+    }
+    names.into_iter().map(|name| dir.join(name)).collect()
+}
 
 /// The directory of a run.
 #[derive(Debug)]
@@ -109,29 +119,19 @@ impl RunDir {
         }
     }
 
-    /// Locks the directory, if it exists, against other training processes.
+    /// Locks the directory, if it exists, against other training processes. Removes incomplete files
+    /// of killed ones.
     ///
     /// # Errors
     /// A directory that another process has locked.
     pub fn lock_if_present(&mut self) -> anyhow::Result<()> {
         if self.path.is_dir() {
             self.lock()?;
-            self.sweep();
-        }
-        Ok(())
-    }
-
-    /// Removes incomplete files of a killed process. A file that cannot be removed does no harm.
-    fn sweep(&self) {
-        for dir in [self.path.clone(), self.path.join("strips")] {
-            for entry in fs::read_dir(dir).into_iter().flatten().flatten() {
-                let name = entry.file_name();
-                let name = name.to_string_lossy();
-                if name.starts_with('.') && name.ends_with(TEMPORARY) {
-                    let _ = fs::remove_file(entry.path());
-                }
+            for dir in [self.path.clone(), self.path.join("strips")] {
+                remove_abandoned(&dir, None);
             }
         }
+        Ok(())
     }
 
     /// The directory.

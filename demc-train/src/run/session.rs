@@ -1,9 +1,10 @@
 //! A session: one process that trains one run, new or resumed, up to its scores.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::ensure;
 use burn::tensor::Device;
+use demc_data::output::Outputs;
 use demc_infer::compute;
 use demc_infer::evaluate::Report;
 
@@ -11,7 +12,8 @@ use crate::config::Config;
 use crate::run::checkpoint::store::{CheckpointSearch, CheckpointStore};
 use crate::run::checkpoint::{self, Checkpoint};
 use crate::run::data::RunData;
-use crate::run::run_dir::RunDir;
+use crate::run::inputs;
+use crate::run::run_dir::{self, RunDir};
 use crate::run::training::{LoopEnd, TrainingRun};
 use crate::tools::estimate::DurationEstimate;
 
@@ -111,6 +113,22 @@ impl Session {
     /// The run.
     pub fn run(&self) -> &TrainingRun {
         &self.run
+    }
+
+    /// Checks that the run's files replace none of its inputs. `files` are the configuration files.
+    ///
+    /// # Errors
+    /// A file of the run that is an input or cannot be replaced.
+    pub fn check_outputs(&self, files: &[PathBuf]) -> anyhow::Result<()> {
+        let mut config = self.run.config().clone();
+        // Only a new run reads its initial weights.
+        config.train.init.take_if(|_| self.run.initial().is_none());
+        let mut outputs = Outputs::default();
+        inputs::protect(&mut outputs, files, &config)?;
+        for file in run_dir::replaced_files(config.run_dir()) {
+            outputs.claim(&file, true)?;
+        }
+        Ok(())
     }
 
     /// One line: duration, steps and device.

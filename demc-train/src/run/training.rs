@@ -18,7 +18,7 @@ use crate::run::checkpoint::store::{CheckpointRetention, CheckpointStore};
 use crate::run::checkpoint::{self, BestValidation, Checkpoint, LoopState, MetricSums};
 use crate::run::data::RunData;
 use crate::run::initial::{InitialNetwork, InitialWeights, initial_network};
-use crate::run::run_dir::RunDir;
+use crate::run::run_dir::{RunDir, SCORES};
 use crate::run::run_record::RunFacts;
 use crate::run::session_clock::SessionClock;
 use crate::run::signals::Signals;
@@ -406,7 +406,7 @@ impl TrainingRun {
             validation::write_strip(self.dir.path(), "test.png", &picture)?;
         }
         self.dir
-            .write("test.json", &serde_json::to_vec_pretty(&report)?)?;
+            .write(SCORES, &serde_json::to_vec_pretty(&report)?)?;
         Ok(Some((bundle.meta.step, report)))
     }
 }

@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::{Context, ensure};
+use anyhow::Context;
 use burn::tensor::Device;
 use demc_data::file::write_whole;
 use demc_data::{Batch, BatchLoader};
@@ -171,15 +171,10 @@ impl Sweep {
     /// # Errors
     /// A file that cannot be written.
     pub fn write(&self, stem: &Path) -> anyhow::Result<[PathBuf; 2]> {
-        ensure!(
-            stem.file_name().is_some(),
-            "{}: expected a file name without extension",
-            stem.display()
-        );
+        let csv = with_extension(stem, "csv")?;
         if let Some(dir) = stem.parent().filter(|dir| !dir.as_os_str().is_empty()) {
             std::fs::create_dir_all(dir).with_context(|| dir.display().to_string())?;
         }
-        let csv = with_extension(stem, "csv");
         write_whole(&csv, |file| {
             std::io::Write::write_all(file, self.csv().as_bytes())
         })?;

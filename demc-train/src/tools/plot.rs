@@ -208,7 +208,11 @@ fn names(runs: &[PathBuf]) -> anyhow::Result<Vec<String>> {
         let ends =
             (1..=depth).map(|kept| path.components().skip(depth - kept).collect::<PathBuf>());
         let shortest = ends.into_iter().find(is_alone);
-        shortest.as_ref().unwrap_or(path).display().to_string()
+        let shown = shortest.as_ref().unwrap_or(path);
+        // Escapes bytes that are not UTF-8, so that names stay different.
+        shown
+            .to_str()
+            .map_or_else(|| format!("{shown:?}"), str::to_owned)
     };
     Ok(paths.iter().map(name).collect())
 }

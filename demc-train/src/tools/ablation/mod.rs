@@ -10,22 +10,22 @@ pub mod spec;
 mod table;
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use burn::tensor::Device;
+use demc_data::output::{Directories, Outputs};
 
 use crate::config::Config;
 use crate::record::metrics_log;
 use crate::record::progress::say;
 use crate::run::checkpoint::store::CheckpointStore;
 use crate::run::initial::read_init;
+use crate::run::inputs;
+use crate::run::run_dir::SCORES;
 use crate::run::session::{Session, SessionOptions, SessionOutcome};
 use comparison::{Comparison, FinishedRun};
 use spec::AblationSpec;
-
-/// Scores of the test split in a run directory.
-const SCORES: &str = "test.json";
 
 /// How an ablation ended.
 #[derive(Debug)]
@@ -44,7 +44,8 @@ pub enum AblationOutcome {
 /// Trains every run of `spec` that is not complete, and compares them. `device` has no autodiff.
 ///
 /// # Errors
-/// Before any training, a `train.init` of another network; a run that cannot be trained or read; no
+/// Before any training, a `train.init` of another network, or a result that would replace an input
+/// or cannot be written; a run that cannot be trained or read; no
 /// test split.
 pub fn run(
     spec: &AblationSpec,
@@ -52,6 +53,7 @@ pub fn run(
     device_name: &str,
 ) -> anyhow::Result<AblationOutcome> {
     check_init(spec)?;
+    check_outputs(spec)?;
     let total = spec.seeds.len() * spec.variants.len();
     let mut runs = vec![Vec::new(); spec.variants.len()];
     let mut number = 0;
@@ -72,6 +74,7 @@ pub fn run(
             };
             let session = Session::open(config.clone(), options, device, device_name)
                 .with_context(|| name.clone())?;
+            session.check_outputs(&spec.files)?;
             say(format!("\n== {name}: {}", session.headline()));
             for warning in &session.warnings {
                 say(format!("warning: {warning}"));
@@ -107,6 +110,17 @@ fn check_init(spec: &AblationSpec) -> anyhow::Result<()> {
     Ok(())
 }
 
+fn check_outputs(spec: &AblationSpec) -> anyhow::Result<()> {
+    let mut outputs = Outputs::default();
+    for variant in &spec.variants {
+        inputs::protect(&mut outputs, &spec.files, &variant.config)?;
+    }
+    for file in table::files(&spec.dir) {
+        outputs.claim(&file, true)?;
+    }
+    Ok(outputs.prepare(Directories::Create)?)
+}
+
 fn finished(config: &Config) -> anyhow::Result<Option<FinishedRun>> {
     let dir = config.run_dir();
     let scores = dir.join(SCORES);
@@ -132,7 +146,7 @@ fn finished(config: &Config) -> anyhow::Result<Option<FinishedRun>> {
 ///
 /// # Errors
 /// A file that cannot be written.
-pub fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<Vec<std::path::PathBuf>> {
+pub fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<[PathBuf; 3]> {
     table::write(comparison, dir)
 }
 

@@ -60,6 +60,8 @@ fn yes() -> bool {
 /// A checked ablation.
 #[derive(Clone, Debug)]
 pub struct AblationSpec {
+    /// The file of the ablation and the configurations of the variants.
+    pub files: Vec<PathBuf>,
     /// Directory of the runs and the results.
     pub dir: PathBuf,
     /// The seeds in training order.
@@ -100,8 +102,10 @@ impl AblationSpec {
             });
         }
         let mut variants = Vec::with_capacity(file.variants.len());
+        let mut files = vec![path.to_owned()];
         for entry in &file.variants {
             let config = entry.config.as_ref().unwrap_or(&file.base);
+            files.push(config.clone());
             let sets = [&file.set[..], &entry.set, sets].concat();
             variants.push(AblationVariant {
                 name: entry.name.clone(),
@@ -112,6 +116,7 @@ impl AblationSpec {
             match_parameters(&mut variants);
         }
         Ok(AblationSpec {
+            files,
             dir: file.dir,
             seeds: file.seeds,
             variants,

@@ -15,18 +15,21 @@ const STEM: &str = "ablation";
 const MEGAPIXEL: f64 = 1e6;
 const GIGA: f64 = 1e9;
 
-pub(super) fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<Vec<PathBuf>> {
+/// Markdown, CSV and JSON.
+pub(super) fn files(dir: &Path) -> [PathBuf; 3] {
+    ["md", "csv", "json"].map(|ending| dir.join(format!("{STEM}.{ending}")))
+}
+
+pub(super) fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<[PathBuf; 3]> {
     std::fs::create_dir_all(dir).with_context(|| dir.display().to_string())?;
     let texts = [
-        ("md", markdown(comparison)),
-        ("csv", csv(comparison)),
-        ("json", serde_json::to_string_pretty(comparison)?),
+        markdown(comparison),
+        csv(comparison),
+        serde_json::to_string_pretty(comparison)?,
     ];
-    let mut paths = Vec::new();
-    for (ending, text) in texts {
-        let path = dir.join(format!("{STEM}.{ending}"));
-        write_whole(&path, |file| file.write_all(text.as_bytes()))?;
-        paths.push(path);
+    let paths = files(dir);
+    for (path, text) in paths.iter().zip(texts) {
+        write_whole(path, |file| file.write_all(text.as_bytes()))?;
     }
     Ok(paths)
 }

@@ -33,10 +33,7 @@ impl Figure {
     /// # Errors
     /// A stem without a file name; a file that cannot be written.
     pub fn write(&self, stem: &Path) -> anyhow::Result<PathBuf> {
-        let name = stem.to_string_lossy();
-        let is_name = stem.file_name().is_some() && !name.ends_with(std::path::is_separator);
-        ensure!(is_name, "{name}: expected a file name without extension");
-        let path = with_extension(stem, "svg");
+        let path = with_extension(stem, "svg")?;
         let svg = svg(&FigurePage::new(self)).with_context(|| path.display().to_string())?;
         write_whole(&path, |file| file.write_all(svg.as_bytes()))?;
         Ok(path)
@@ -44,11 +41,20 @@ impl Figure {
 }
 
 /// `STEM.EXTENSION`. Unlike `Path::with_extension`, it keeps a dot in the stem.
-pub(crate) fn with_extension(stem: &Path, extension: &str) -> PathBuf {
+///
+/// # Errors
+/// A stem without a file name.
+pub fn with_extension(stem: &Path, extension: &str) -> anyhow::Result<PathBuf> {
+    let is_directory = stem.as_os_str().as_encoded_bytes().ends_with(b"/");
+    ensure!(
+        stem.file_name().is_some() && !is_directory,
+        "{}: expected a file name without extension",
+        stem.display()
+    );
     let mut path = OsString::from(stem);
     path.push(".");
     path.push(extension);
-    path.into()
+    Ok(path.into())
 }
 
 fn svg(page: &FigurePage) -> anyhow::Result<String> {
