@@ -173,7 +173,8 @@ class Outputs(Attack):
             program = [str(common.PROGRAMS / "demc-train"), "--config", "tiny.toml", *sets, "--run-dir", "/tmp/x"]
             self.one_line(common.run("demc-train", *program[1:], cwd=bad), 2, "UTF-8")
         allowed = [
-            ["demc-infer", "denoise", b"d\xff/frame.exr", "-o", b"d\xff/out.exr", "--model", b"d\xff/model.safetensors"],
+            ["demc-infer", "denoise", b"d\xff/frame.exr", "-o", b"d\xff/out.exr",
+             "--model", b"d\xff/model.safetensors"],
             ["demc-infer", "denoise", b"d\xff", "-o", "out/", "--model", "model.safetensors"],
             ["demc-data", "merge", b"d\xff/frame.exr", "-o", b"d\xff/merged.exr"],
         ]
