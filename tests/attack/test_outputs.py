@@ -173,7 +173,8 @@ class Outputs(Attack):
             program = [str(common.PROGRAMS / "demc-train"), "--config", "tiny.toml", *sets, "--run-dir", "/tmp/x"]
             self.one_line(common.run("demc-train", *program[1:], cwd=bad), 2, "UTF-8")
         allowed = [
-            ["demc-infer", "denoise", b"d\xff/frame.exr", "-o", b"d\xff/out.exr", "--model", b"d\xff/model.safetensors"],
+            ["demc-infer", "denoise", b"d\xff/frame.exr", "-o", b"d\xff/out.exr",
+             "--model", b"d\xff/model.safetensors"],
             ["demc-infer", "denoise", b"d\xff", "-o", "out/", "--model", "model.safetensors"],
             ["demc-data", "merge", b"d\xff/frame.exr", "-o", b"d\xff/merged.exr"],
         ]
@@ -244,7 +245,7 @@ class Outputs(Attack):
             file.write_bytes(data)
         (self.root / "file").write_bytes(b"")
         (self.root / "protected").mkdir()
-        for output in self.outputs:
+        for number, output in enumerate(self.outputs):
             if output.name.startswith(("train", "index")):
                 continue
             ending, name = output.ending, os.path.basename(output.file)
@@ -263,7 +264,9 @@ class Outputs(Attack):
                 if not (self.root / f"fifo{ending}").exists():
                     os.mkfifo(self.root / f"fifo{ending}")
             places["no permission"] = f"protected/{name}"
-            for problem, path in places.items():
+            for order, (problem, path) in enumerate(places.items()):
+                if (number + order) % 2 and not common.LONG:
+                    continue  # The short form tries every problem with every other output.
                 if problem == "a directory" and output.name.startswith("denoise") and not ending:
                     continue  # It gets the image.
                 with self.subTest(output=output.name, problem=problem):

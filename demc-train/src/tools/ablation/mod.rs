@@ -44,9 +44,8 @@ pub enum AblationOutcome {
 /// Trains every run of `spec` that is not complete, and compares them. `device` has no autodiff.
 ///
 /// # Errors
-/// Before any training, a `train.init` of another network, or a result that would replace an input
-/// or cannot be written; a run that cannot be trained or read; no
-/// test split.
+/// Before any training: a `train.init` of another network, or a result that would replace an input
+/// or cannot be written. Later: a run that cannot be trained or read; no test split.
 pub fn run(
     spec: &AblationSpec,
     device: &Device,
