@@ -18,6 +18,7 @@
 //! # Ok::<(), demc_data::Error>(())
 //! ```
 #![forbid(unsafe_code)]
+#![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod augment;
 pub mod batch;
@@ -34,9 +35,10 @@ pub mod frame;
 pub mod geometry;
 pub mod layout;
 pub mod loader;
+pub mod message;
 mod moments;
 pub mod noise;
-mod parallel;
+pub mod parallel;
 pub mod patch;
 pub mod plane;
 pub mod position;

@@ -54,6 +54,28 @@ impl ComputeFlags {
     }
 }
 
+/// Runs a program's `work` on one of its threads: as many as `RAYON_NUM_THREADS` asks for, at most
+/// four per processor ([`demc_data::parallel::threads`]).
+///
+/// # Errors
+/// The system cannot start the threads.
+pub fn on_threads<R: Send>(work: impl FnOnce() -> R + Send) -> Result<R, ThreadsError> {
+    let count = demc_data::parallel::threads().count;
+    ops::start_threads(count).map_err(|error| ThreadsError {
+        count,
+        reason: error.to_string(),
+    })?;
+    Ok(ops::within_pool(work))
+}
+
+/// The system cannot start the threads.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("cannot start {count} threads: {reason}; lower RAYON_NUM_THREADS or raise the limits")]
+pub struct ThreadsError {
+    count: usize,
+    reason: String,
+}
+
 /// Describes the operations and instruction set of networks that are now built for `device`.
 pub fn describe(device: &Device) -> String {
     ops::process_default().describe(device)

@@ -8,6 +8,7 @@
 //!   [`step::optimizer`] updates the weights.
 //! - [`record`] writes metrics, TensorBoard events and the progress bar.
 //! - [`tools`] compares variants, finds learning rates and draws charts.
+#![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod config;
 pub mod record;

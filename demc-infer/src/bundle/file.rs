@@ -5,13 +5,14 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use demc_data::frame::FEATURE_NAMES;
+use demc_data::message::printable;
 use demc_model::Weight;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, Metadata};
 use serde::Deserialize;
 
 use super::encode::KEY;
-use super::tensors::{one_line, values};
+use super::tensors::values;
 use super::{BundleError, BundleMeta, FORMAT, Names, Precision, locate};
 
 /// Longest accepted header in bytes (ours: the widest network's has 20 kB).
@@ -63,13 +64,13 @@ impl BundleFile {
             }
             let data = values(&view).map_err(|detail| BundleError::Tensor {
                 path: path.clone(),
-                name: one_line(name),
+                name: printable(name),
                 detail,
             })?;
             weights.push(Weight {
                 name: match specs.remove(name) {
                     Some(spec) => spec.name,
-                    None => one_line(name),
+                    None => printable(name),
                 },
                 shape: view.shape().to_vec(),
                 data,
@@ -129,7 +130,7 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>, BundleError> {
 pub(super) fn damaged(path: &Path, error: &safetensors::SafeTensorError) -> BundleError {
     BundleError::Damaged {
         path: path.into(),
-        detail: one_line(&error.to_string()),
+        detail: printable(&error.to_string()),
     }
 }
 
@@ -157,7 +158,7 @@ fn parse_header(entry: &str, path: &Path) -> Result<(BundleMeta, Names), BundleE
     }
     let invalid = |detail: String| BundleError::Header {
         path: path.into(),
-        detail: one_line(&detail),
+        detail: printable(&detail),
     };
     let json = |error: serde_json::Error| invalid(error.to_string());
     let Version { format } = serde_json::from_str(entry).map_err(json)?;

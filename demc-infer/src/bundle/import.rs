@@ -3,12 +3,13 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use demc_data::message::printable;
 use demc_model::{Role, Weight, WeightSpec};
 use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
 
 use super::file::{damaged, parse_meta, read};
-use super::tensors::{one_line, values};
+use super::tensors::values;
 use super::{BundleError, BundleFile, BundleMeta, Names, Precision};
 
 /// Invalid tensors by kind of problem.
@@ -60,7 +61,7 @@ impl BundleFile {
         let file = SafeTensors::deserialize(&bytes).map_err(|error| damaged(path, &error))?;
         let mut found: BTreeMap<String, _> = file
             .iter()
-            .map(|(name, view)| (one_line(name), view))
+            .map(|(name, view)| (printable(name), view))
             .collect();
         let mut problems = TensorProblems::default();
         let mut precision = Precision::F32;

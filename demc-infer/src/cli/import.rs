@@ -4,9 +4,10 @@ use std::path::PathBuf;
 
 use burn::tensor::Device;
 use clap::Args;
+use demc_data::message::{self, printable};
 use demc_infer::{BundleError, BundleFile, Names, Precision};
 
-use super::{not_an_input, print};
+use super::not_an_input;
 
 /// Import weights that were trained in PyTorch with the package of python/.
 ///
@@ -53,9 +54,10 @@ impl Arguments {
         let bundle = file.into_bundle(&Device::flex())?;
         bundle.export(&self.output, Names::Burn, Precision::F32)?;
         let tensors = bundle.model.weights().len();
-        let output = self.output.display();
-        print(&format!(
+        let output = printable(&self.output.display().to_string());
+        message::status(format_args!(
             "{output}: {tensors} tensors, read back and compared"
-        ))
+        ));
+        Ok(())
     }
 }

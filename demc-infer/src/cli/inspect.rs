@@ -1,18 +1,17 @@
 //! `demc-infer inspect`: shows a model's network, statistics and channel layout.
 
 use std::fmt::Write;
-use std::path::PathBuf;
 
 use burn::tensor::Device;
 use clap::Args;
 use demc_data::ChannelLayout;
 use demc_data::frame::FEATURE_NAMES;
 use demc_data::layout::Missing;
+use demc_data::message::{self, printable};
 use demc_infer::{Bundle, BundleMeta, Names, Precision};
 use serde::Serialize;
 
 use super::flags::ModelFlag;
-use super::print;
 
 /// Show a model: network, training step, statistics and input channels.
 ///
@@ -34,7 +33,7 @@ pub struct Arguments {
 
 #[derive(Serialize)]
 struct ModelSummary {
-    file: PathBuf,
+    file: String,
     #[serde(flatten)]
     meta: BundleMeta,
     names: Names,
@@ -47,7 +46,11 @@ struct ModelSummary {
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let source = self.model.read()?;
-        let (file, names, precision) = (source.path.clone(), source.names, source.precision);
+        let (file, names, precision) = (
+            source.path.display().to_string(),
+            source.names,
+            source.precision,
+        );
         let Bundle { meta, .. } = source.into_bundle(&Device::flex())?;
         let specs = meta.model.weight_specs().into_iter();
         let tensors = match self.tensors {
@@ -65,10 +68,11 @@ impl Arguments {
             parameters,
             tensors,
         };
-        print(&match self.json {
-            true => serde_json::to_string_pretty(&summary)?,
+        let text = match self.json {
+            true => message::json(&summary)?,
             false => summary.text()?,
-        })
+        };
+        Ok(message::result(&text)?)
     }
 }
 
@@ -77,7 +81,7 @@ impl ModelSummary {
         let Self { meta, .. } = self;
         let mut text = String::new();
         let t = &mut text;
-        writeln!(t, "file        {}", self.file.display())?;
+        writeln!(t, "file        {}", printable(&self.file))?;
         writeln!(t, "network     {}", meta.model)?;
         writeln!(t, "parameters  {}", self.parameters)?;
         writeln!(t, "step        {}", meta.step)?;
@@ -123,8 +127,9 @@ impl ModelSummary {
 
 /// The buffers of a layout: name, channels, and the replacement for missing channels.
 fn buffers(layout: &ChannelLayout) -> Vec<(&'static str, String, &'static str)> {
-    let channels =
-        |names: Option<&[String; 3]>| names.map_or("none".into(), |names| names.join(" "));
+    let channels = |names: Option<&[String; 3]>| {
+        names.map_or("none".into(), |names| printable(&names.join(" ")))
+    };
     let mut rows = vec![("color", channels(Some(&layout.color)), "refused")];
     for (buffer, names, missing) in layout.features() {
         let missing = match missing {

@@ -19,6 +19,7 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use demc_data::DataConfig;
+use demc_data::message::printable;
 use demc_model::{LossConfig, ModelConfig, Variant};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -100,8 +101,7 @@ impl Config {
     pub fn parse(path: &Path, text: &str, sets: &[String]) -> Result<Self, ConfigError> {
         let config = source::parse::<Config>(path, text, sets, &Self::keys());
         // Keys may contain line breaks and terminal control codes.
-        let printable = |error: String| error.replace(char::is_control, "\u{fffd}");
-        let mut config = config.map_err(|error| ConfigError::Source(printable(error)))?;
+        let mut config = config.map_err(|error| ConfigError::Source(printable(&error)))?;
         let problems = config.validate();
         if !problems.is_empty() {
             return Err(ConfigError::Values {

@@ -3,6 +3,7 @@
 pub mod checkpoint;
 pub mod data;
 pub mod initial;
+pub mod memory;
 pub mod run_dir;
 pub mod session;
 pub mod signals;

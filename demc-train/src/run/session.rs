@@ -11,6 +11,7 @@ use crate::config::Config;
 use crate::run::checkpoint::store::{CheckpointSearch, CheckpointStore};
 use crate::run::checkpoint::{self, Checkpoint};
 use crate::run::data::RunData;
+use crate::run::memory;
 use crate::run::run_dir::RunDir;
 use crate::run::training::{LoopEnd, TrainingRun};
 use crate::tools::estimate::DurationEstimate;
@@ -73,6 +74,7 @@ impl Session {
             dir.lock_if_present()?;
         }
         let data = RunData::open(&config)?;
+        memory::check(&config, device)?;
         let mut notes = Vec::new();
         if data.clamped > 0 {
             let clamped = data.clamped;
