@@ -168,9 +168,7 @@ fn block(size: usize) -> (*mut u8, bool) {
     let mut pointer = system::map(mapped);
     if pointer.is_null() {
         // A limit may leave no room beside the free blocks.
-        while let Some(smaller) = kept().any() {
-            give_back(Some(smaller));
-        }
+        std::iter::from_fn(|| kept().any()).for_each(|block| give_back(Some(block)));
         pointer = system::map(mapped);
     }
     if pointer.is_null() {

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Args;
+use demc_data::message::printable;
 use demc_train::record::progress::say;
 use demc_train::tools::plot::{PlotOptions, plot};
 
@@ -40,6 +41,6 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     } = arguments;
     let stem = out.unwrap_or_else(|| runs[0].join("curves"));
     let path = plot(&runs, &stem, &PlotOptions { smooth, linear })?;
-    say(path.display());
+    say(printable(&path.display().to_string()));
     Ok(ExitCode::SUCCESS)
 }

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
+use demc_data::message::printable;
 use demc_train::config::Config;
 use demc_train::record::progress::say;
 use demc_train::run::session::{Session, SessionOptions, SessionOutcome};
@@ -40,6 +41,11 @@ pub struct Arguments {
     check: bool,
 }
 
+/// A path in one line.
+fn shown(path: &Path) -> String {
+    printable(&path.display().to_string())
+}
+
 /// The edit that sets the run directory.
 fn run_dir_set(dir: &Path) -> String {
     let dir = toml::Value::String(dir.to_string_lossy().into_owned());
@@ -61,9 +67,9 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let session = Session::open(config, options, &device, &arguments.compute.device)?;
     say(format!("demc-train: {}", session.headline()));
     say(format!("\n{}", session.run().config().to_toml()));
-    say(format!("data: {} in {}", session.data, root.display()));
+    say(format!("data: {} in {}", session.data, shown(&root)));
     for note in &session.notes {
-        say(format!("note: {note}"));
+        say(format!("note: {}", printable(note)));
     }
     let run = session.run();
     say(format!(
@@ -79,7 +85,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         say("check: configuration and data are valid; nothing was written");
         return Ok(ExitCode::SUCCESS);
     }
-    say(format!("run: {}\n", dir.display()));
+    say(format!("run: {}\n", shown(&dir)));
     match session.finish()? {
         SessionOutcome::Stopped { signal, step } => {
             return Ok(stopped(signal, step, "--resume resumes the run"));
@@ -94,6 +100,6 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
             }
         }
     }
-    say(format!("\nweights, pictures and scores: {}", dir.display()));
+    say(format!("\nweights, pictures and scores: {}", shown(&dir)));
     Ok(ExitCode::SUCCESS)
 }
