@@ -56,6 +56,11 @@ fn available_below(root: &Path) -> Option<u64> {
         .min()
 }
 
+/// Bytes that the limits of this process (`ulimit -v`, `ulimit -d`) leave; `None` without limits.
+pub fn below_own_limits() -> Option<u64> {
+    own_limits(Path::new("/")).into_iter().min()
+}
+
 /// Address space beside buffers that a limited process needs, in bytes: threads, and the ends of
 /// large pages (ours).
 const SPARE: u64 = 64 << 20;
