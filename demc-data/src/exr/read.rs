@@ -1,6 +1,6 @@
 //! The headers of a file and, on demand, its channels.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::fs::{self, File};
 use std::io::{self, BufReader, Read, Seek};
 use std::path::{Path, PathBuf};
@@ -151,6 +151,12 @@ impl<R: Read + Seek> ExrFile<R> {
             .cloned()
             .collect();
         let mut planes: Vec<Plane> = wanted.iter().map(|channel| empty(channel.kind)).collect();
+        // A file that cannot hold its pixels is damaged, whatever memory there is.
+        guarded(&self.path, || {
+            let parts: BTreeSet<usize> = wanted.iter().map(|channel| channel.part).collect();
+            let mut parts = parts.into_iter();
+            parts.try_for_each(|part| self.source.grid(part).map(drop))
+        })?;
         self.reserve(&wanted, &mut planes)?;
         guarded(&self.path, || {
             decode(&mut self.source, &wanted, &mut planes)
