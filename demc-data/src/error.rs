@@ -3,6 +3,8 @@
 
 use std::path::PathBuf;
 
+use crate::message::list;
+
 /// An error of this crate.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "the messages explain the fields")]
@@ -22,8 +24,15 @@ pub enum Error {
     /// Not an OpenEXR file, truncated, damaged, or of an unsupported kind (deep data, subsampling).
     #[error("{}: not a readable OpenEXR file: {detail}", path.display())]
     Exr { path: PathBuf, detail: String },
+    /// Memory does not suffice for the pixels of a file.
+    #[error("{}: its pixels do not fit into memory: {needed} MiB are needed", path.display())]
+    Memory {
+        path: PathBuf,
+        /// Size of the buffer that could not be allocated, MiB.
+        needed: usize,
+    },
     /// The file lacks channels that the layout names.
-    #[error("{}: no channel {}; the file has {}", path.display(), missing.join(", "), present.join(", "))]
+    #[error("{}: no channel {}; the file has {}", path.display(), list(missing), list(present))]
     MissingChannels {
         path: PathBuf,
         missing: Vec<String>,

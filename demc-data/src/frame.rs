@@ -101,7 +101,7 @@ pub fn decode_repaired<R: Read + Seek>(
 ) -> Result<(Frame, usize), Error> {
     let (planes, repaired) =
         FramePlanes::decode_with(file, layout, Presence::Skip, Presence::IfPresent, true)?;
-    Ok((frame_of(planes, file.path()), repaired))
+    Ok((frame_of(planes, file.path())?, repaired))
 }
 
 /// Reads a frame with its reference. NaN, infinite, and negative samples are replaced as by
@@ -113,7 +113,7 @@ pub(crate) fn read_pair(path: &Path, layout: &ChannelLayout, repair: bool) -> Re
     let mut file = ExrFile::open(path)?.on_threads(1);
     let (reference, mask) = (Presence::Required, Presence::IfPresent);
     let planes = FramePlanes::decode_with(&mut file, layout, reference, mask, repair)?;
-    Ok(frame_of(planes.0, path))
+    frame_of(planes.0, path)
 }
 
 fn decode<R: Read + Seek>(
@@ -122,26 +122,33 @@ fn decode<R: Read + Seek>(
     reference: Presence,
 ) -> Result<Frame, Error> {
     let planes = FramePlanes::decode(file, layout, reference, Presence::IfPresent)?;
-    Ok(frame_of(planes, file.path()))
+    frame_of(planes, file.path())
 }
 
-fn frame_of(planes: FramePlanes, path: &Path) -> Frame {
+fn frame_of(planes: FramePlanes, path: &Path) -> Result<Frame, Error> {
     let name = path
         .file_stem()
         .unwrap_or_default()
         .to_string_lossy()
         .into_owned();
-    Frame {
+    let planar = |planes: Vec<Plane>| {
+        planar(&planes).map_err(|needed| Error::Memory {
+            path: path.to_owned(),
+            needed,
+        })
+    };
+    let plane = |plane: Option<Plane>| plane.map(|plane| planar(vec![plane])).transpose();
+    Ok(Frame {
         name,
         width: planes.width,
         height: planes.height,
-        color: planar(&planes.color),
-        features: planar(&planes.features),
-        reference: planes.reference.as_deref().map(planar),
-        mask: planes.mask.as_ref().map(Plane::to_f32),
-        alpha: planes.alpha.as_ref().map(Plane::to_f32),
+        color: planar(planes.color)?,
+        features: planar(planes.features)?,
+        reference: planes.reference.map(planar).transpose()?,
+        mask: plane(planes.mask)?,
+        alpha: plane(planes.alpha)?,
         clamped: planes.clamped,
-    }
+    })
 }
 
 /// An image's checked buffers in the precision of the file.
@@ -420,12 +427,19 @@ fn slots(names: &Triple) -> Vec<Option<&str>> {
     names.iter().map(|name| Some(name.as_str())).collect()
 }
 
-fn planar(planes: &[Plane]) -> Vec<f32> {
+/// The samples of all planes. The error is the size of the memory that is missing, in MiB.
+fn planar(planes: &[Plane]) -> Result<Vec<f32>, usize> {
     let pixels = planes.first().map_or(0, Plane::len);
-    let mut samples = vec![0.0; planes.len() * pixels];
+    let count = planes.len() * pixels;
+    let mut samples: Vec<f32> = Vec::new();
+    let reserved = samples.try_reserve_exact(count);
+    reserved.map_err(|_| (count * size_of::<f32>()).div_ceil(1 << 20))?;
+    samples.resize(count, 0.0);
     let parts = samples.chunks_exact_mut(pixels.max(1)).zip(planes);
-    parallel::map(parallel::available(), parts.collect(), |(part, plane)| {
-        plane.copy_to(0, part)
-    });
-    samples
+    parallel::map(
+        parallel::threads().count,
+        parts.collect(),
+        |(part, plane)| plane.copy_to(0, part),
+    );
+    Ok(samples)
 }

@@ -24,6 +24,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::Error;
+use crate::message::printable;
 
 pub use detect::{FileLayout, detect};
 
@@ -238,7 +239,7 @@ fn mistake(name: &str, detail: String) -> Error {
 fn one_line(error: &toml::de::Error, text: &str) -> String {
     let message = error.message().trim_end().replace('\n', ", ");
     // A key may contain terminal control codes.
-    let message = message.replace(char::is_control, "\u{fffd}");
+    let message = printable(&message);
     match error.span() {
         Some(span) => {
             let line = text[..span.start.min(text.len())].lines().count().max(1);

@@ -18,6 +18,7 @@
 //! # Ok::<(), demc_data::Error>(())
 //! ```
 #![forbid(unsafe_code)]
+#![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod augment;
 pub mod batch;
@@ -36,10 +37,11 @@ pub mod frame;
 pub mod geometry;
 pub mod layout;
 pub mod loader;
+pub mod message;
 mod moments;
 pub mod noise;
 pub mod output;
-mod parallel;
+pub mod parallel;
 pub mod patch;
 pub mod plane;
 pub mod position;

@@ -1,5 +1,8 @@
 //! `demc-data`: prepares and inspects images and data sets before training.
 
+#![forbid(unsafe_code)]
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
 mod cli;
 
 use std::process::ExitCode;
@@ -8,7 +11,11 @@ use clap::Parser;
 use demc_data::output::OutputError;
 
 fn main() -> ExitCode {
-    match cli::Cli::parse().run() {
+    let cli = cli::Cli::parse();
+    if let Some(note) = &demc_data::parallel::threads().note {
+        demc_data::message::say(format_args!("note: {note}"));
+    }
+    match cli.run() {
         Ok(status) => status,
         Err(error) => {
             cli::report(&error);

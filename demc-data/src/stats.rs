@@ -45,7 +45,7 @@ impl Statistics {
         config: &DataConfig,
         relmse_epsilon: f32,
     ) -> Result<Self, Error> {
-        let threads = parallel::available().min(MAX_THREADS);
+        let threads = parallel::threads().count.min(MAX_THREADS);
         Self::measure_on(threads, scenes, layout, config, relmse_epsilon)
     }
 

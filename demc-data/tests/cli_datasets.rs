@@ -347,7 +347,7 @@ fn names_from_files_are_printed_without_control_characters() {
     assert_eq!(text.lines().count(), 2, "{text:?}");
     assert!(!text.contains('\u{1b}'), "{text:?}");
     assert!(
-        text.starts_with("files are missing: a\u{fffd}[2J\u{fffd}b ("),
+        text.starts_with("files are missing: a\\u{1b}[2J\\nb ("),
         "{text:?}"
     );
 }

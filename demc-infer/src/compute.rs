@@ -3,6 +3,8 @@
 use burn::tensor::Device;
 use demc_model::ops::{self, ISA_VARIABLE, Isa, Ops, UnknownIsa};
 
+use crate::memory;
+
 /// Flags for operations and instruction set.
 #[derive(Clone, Copy, Debug)]
 #[cfg_attr(feature = "cli", derive(clap::Args))]
@@ -52,6 +54,40 @@ impl ComputeFlags {
         }
         Ok(())
     }
+}
+
+/// Memory in bytes without which a program cannot read a model (ours: 250 MiB of address space suffice
+/// for the bundled one).
+const LEAST_MEMORY: u64 = 128 << 20;
+
+/// Runs a program's `work` on one of its threads: as many as `RAYON_NUM_THREADS` asks for, at most
+/// four per processor ([`demc_data::parallel::threads`]).
+///
+/// # Errors
+/// The process's limits leave too little memory or too few threads.
+pub fn on_threads<R: Send>(work: impl FnOnce() -> R + Send) -> Result<R, StartError> {
+    if let Some(left) = memory::below_own_limits().filter(|left| *left < LEAST_MEMORY) {
+        let left = left >> 20;
+        return Err(StartError::Memory { left });
+    }
+    let count = demc_data::parallel::threads().count;
+    ops::start_threads(count).map_err(|error| StartError::Threads {
+        count,
+        reason: error.to_string(),
+    })?;
+    Ok(ops::within_pool(work))
+}
+
+/// The process's limits are too low for any work.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages explain the fields")]
+pub enum StartError {
+    /// Too little memory, in MiB.
+    #[error("the limits on memory leave {left} MiB, but {} are needed; raise ulimit -v", LEAST_MEMORY >> 20)]
+    Memory { left: u64 },
+    /// Too few threads.
+    #[error("cannot start {count} threads: {reason}; lower RAYON_NUM_THREADS or raise the limits")]
+    Threads { count: usize, reason: String },
 }
 
 /// Describes the operations and instruction set of networks that are now built for `device`.

@@ -1,6 +1,7 @@
 //! Why a frame cannot be denoised or scored.
 
 use burn::tensor::TensorReadError;
+use demc_data::exr::{UnsupportedSize, check_size};
 use demc_data::{FEATURES, Frame};
 use demc_model::config::COLOR_CHANNELS;
 use demc_model::metrics::ImageError;
@@ -23,6 +24,12 @@ pub enum DenoiseError {
         width: usize,
         /// The frame's height in pixels.
         height: usize,
+    },
+    /// The image exceeds the limits of files.
+    #[error("{name}")]
+    Limit {
+        name: String,
+        source: UnsupportedSize,
     },
     /// The image does not fit into memory.
     #[error("{name}")]
@@ -78,10 +85,14 @@ pub(crate) fn check_sizes(frame: &Frame) -> Result<(), DenoiseError> {
         ("color", frame.color.len(), COLOR_CHANNELS),
         ("features", frame.features.len(), FEATURES),
     ];
+    check_size(width, height).map_err(|source| DenoiseError::Limit {
+        name: frame.name.clone(),
+        source,
+    })?;
     let mask = frame.mask.as_ref().map(|mask| ("mask", mask.len(), 1));
     for (buffer, found, channels) in checks.into_iter().chain(mask) {
         let expected = channels * width * height;
-        if found != expected || expected == 0 {
+        if found != expected {
             return Err(DenoiseError::Size {
                 name: frame.name.clone(),
                 buffer,

@@ -42,7 +42,7 @@
 //!
 //! - [`bundle`]: a [`Bundle`] is a network with its configuration, normalisation statistics,
 //!   channel layout and training step. This module alone reads and writes its file.
-//! - [`denoise`]: denoises a frame of any size, with [`padding`], [`tiles`] that fit into the
+//! - [`denoise`]: denoises a frame of the size of any file, with [`padding`], [`tiles`] that fit into the
 //!   available [`memory`], and optional test-time augmentation ([`ensemble`](mod@ensemble)).
 //! - [`guard`]: compares an image with the training data, then refuses it or warns.
 //! - [`onnx`]: exports the network for other runtimes. [`verify`](mod@verify) compares their output
@@ -54,6 +54,7 @@
 //! Training validates with this code. The library never prints or exits. Every error names the
 //! frame, file or channel.
 #![forbid(unsafe_code)]
+#![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod baseline;
 pub mod bundle;

@@ -1,7 +1,7 @@
 //! Available memory, measured before an image is denoised.
 //!
-//! On Linux, it is the minimum of the machine's available memory and of what each control group of
-//! this process leaves (containers, batch systems). Memory that this process keeps for its next
+//! On Linux, it is the least that the machine, each control group of this process (containers,
+//! batch systems), and the process's own limits (`ulimit -v`, `ulimit -d`) leave. Memory that this process keeps for its next
 //! image counts as available. On other systems it is unknown, and no image is refused.
 
 use std::fs;
@@ -51,8 +51,36 @@ fn available_below(root: &Path) -> Option<u64> {
     let groups = control_groups(root).into_iter();
     groups
         .filter_map(|group| group.available())
+        .chain(own_limits(root))
         .chain([machine])
         .min()
+}
+
+/// Bytes that the limits of this process (`ulimit -v`, `ulimit -d`) leave; `None` without limits.
+pub fn below_own_limits() -> Option<u64> {
+    own_limits(Path::new("/")).into_iter().min()
+}
+
+/// Address space beside buffers that a limited process needs, in bytes: threads, and the ends of
+/// large pages (ours).
+const SPARE: u64 = 64 << 20;
+
+/// What the limits of this process leave; nothing without limits.
+fn own_limits(root: &Path) -> Vec<u64> {
+    let process = root.join("proc/self");
+    let limits = fs::read_to_string(process.join("limits")).unwrap_or_default();
+    let left = |(limit, used): (&str, &str)| {
+        // Without a limit, the line has `unlimited`.
+        let line = limits.lines().find_map(|line| line.strip_prefix(limit))?;
+        let limit: u64 = line.split_whitespace().next()?.parse().ok()?;
+        let used = value(&process.join("status"), used)? << 10;
+        Some(limit.saturating_sub(used + SPARE))
+    };
+    let both = [
+        ("Max address space", "VmSize:"),
+        ("Max data size", "VmData:"),
+    ];
+    both.into_iter().filter_map(left).collect()
 }
 
 /// A control group of version 1 or 2.
@@ -172,6 +200,31 @@ mod tests {
             ("sys/fs/cgroup/memory/memory.usage_in_bytes", "1500000\n"),
         ];
         assert_eq!(available(&files), Some(500_000));
+    }
+
+    #[test]
+    fn limits_of_the_process_count() {
+        let available = |space: &str, data: &str| {
+            let limits = format!(
+                "Limit  Soft Limit  Hard Limit  Units\n\
+                 Max data size             {data}            unlimited            bytes     \n\
+                 Max address space         {space}           unlimited            bytes     \n"
+            );
+            let root = system(&[
+                ("proc/meminfo", "MemAvailable: 4000000 kB\n"),
+                ("proc/self/limits", &limits),
+                (
+                    "proc/self/status",
+                    "Name: demc\nVmSize:  1000 kB\nVmData:  500 kB\n",
+                ),
+            ]);
+            available_below(root.path())
+        };
+        let bytes = |used: u64| Some((1 << 30) - (used << 10) - SPARE);
+        assert_eq!(available("unlimited", "unlimited"), Some(4_000_000 << 10));
+        assert_eq!(available("1073741824", "unlimited"), bytes(1000));
+        assert_eq!(available("unlimited", "1073741824"), bytes(500));
+        assert_eq!(available("1", "unlimited"), Some(0));
     }
 
     #[test]

@@ -11,6 +11,7 @@
 
 use std::ops::Range;
 
+use demc_data::exr::MAX_SIDE;
 use demc_model::DOWNSAMPLING;
 
 use crate::memory::TooLarge;
@@ -56,9 +57,9 @@ impl Tiling {
         }
     }
 
-    /// The halo, rounded up to the network's grid.
+    /// The halo, rounded up to the network's grid; at most an image's side.
     fn grid_halo(&self) -> usize {
-        self.halo.next_multiple_of(DOWNSAMPLING)
+        self.halo.min(MAX_SIDE).next_multiple_of(DOWNSAMPLING)
     }
 }
 
@@ -96,34 +97,32 @@ impl Tiles {
         available: Option<u64>,
     ) -> Result<Self, TooLarge> {
         let halo = tiling.grid_halo();
-        let fits = |rows: &[Span], columns: &[Span]| {
-            available.is_none_or(|bytes| need(longest(rows), longest(columns)) <= bytes)
+        let fits = |rows: &AxisCut, columns: &AxisCut| {
+            available.is_none_or(|bytes| need(rows.longest, columns.longest) <= bytes)
         };
-        let axis = |length: usize| -> Vec<Vec<Span>> {
+        let axis = |length: usize| -> Vec<AxisCut> {
             let side = tiling.side.unwrap_or(length).max(DOWNSAMPLING);
             let blocks = length / DOWNSAMPLING;
             let fewest = blocks.div_ceil(side / DOWNSAMPLING);
             (fewest..=blocks)
-                .map(|count| spans(blocks, count, halo))
+                .map(|count| AxisCut::new(blocks, count, halo))
                 .collect()
         };
         let (rows, columns) = (axis(height), axis(width));
-        let mut best: Option<(u64, Self)> = None;
-        for rows in &rows {
+        let fitting = rows.iter().filter_map(|rows| {
             // Columns finer than the first fit compute more.
-            let Some(columns) = columns.iter().find(|columns| fits(rows, columns)) else {
-                continue;
-            };
-            let tiles = Self {
-                rows: rows.clone(),
-                columns: columns.clone(),
-            };
-            let computed = tiles.computed_pixels();
-            if best.as_ref().is_none_or(|(least, _)| computed < *least) {
-                best = Some((computed, tiles));
-            }
-        }
-        best.map(|(_, tiles)| tiles).ok_or_else(|| {
+            let columns = columns.iter().find(|columns| fits(rows, columns))?;
+            Some((rows, columns))
+        });
+        let best = fitting.min_by_key(|(rows, columns)| rows.total * columns.total);
+        let cut = |length: usize, axis: &AxisCut| {
+            spans(length / DOWNSAMPLING, axis.count, halo).collect()
+        };
+        let best = best.map(|(rows, columns)| Self {
+            rows: cut(height, rows),
+            columns: cut(width, columns),
+        });
+        best.ok_or_else(|| {
             let smallest = (2 * halo + DOWNSAMPLING).min(height.max(width));
             TooLarge {
                 width,
@@ -165,15 +164,34 @@ impl Tiles {
     }
 }
 
+/// What the plan must know about one cut of an axis.
+struct AxisCut {
+    /// Number of spans.
+    count: usize,
+    /// The longest span with its halo, pixels.
+    longest: usize,
+    /// All spans with their halos, pixels.
+    total: u64,
+}
+
+impl AxisCut {
+    fn new(blocks: usize, count: usize, halo: usize) -> Self {
+        let lengths = || spans(blocks, count, halo).map(|span| span.read.len());
+        Self {
+            count,
+            longest: lengths().max().unwrap_or(0),
+            total: lengths().sum::<usize>() as u64,
+        }
+    }
+}
+
 /// Cuts an axis of `blocks` times 32 pixels into `count` spans of nearly equal length.
-fn spans(blocks: usize, count: usize, halo: usize) -> Vec<Span> {
-    let edge = |i: usize| i * blocks / count * DOWNSAMPLING;
-    (0..count)
-        .map(|i| Span {
-            core: edge(i)..edge(i + 1),
-            read: edge(i).saturating_sub(halo)..(edge(i + 1) + halo).min(blocks * DOWNSAMPLING),
-        })
-        .collect()
+fn spans(blocks: usize, count: usize, halo: usize) -> impl Iterator<Item = Span> {
+    let edge = move |i: usize| i * blocks / count * DOWNSAMPLING;
+    (0..count).map(move |i| Span {
+        core: edge(i)..edge(i + 1),
+        read: edge(i).saturating_sub(halo)..(edge(i + 1) + halo).min(blocks * DOWNSAMPLING),
+    })
 }
 
 fn longest(spans: &[Span]) -> usize {
@@ -237,13 +255,26 @@ mod tests {
         for rows in 1..=height / 32 {
             for columns in 1..=width / 32 {
                 let other = Tiles {
-                    rows: spans(height / 32, rows, EXACT_HALO),
-                    columns: spans(width / 32, columns, EXACT_HALO),
+                    rows: spans(height / 32, rows, EXACT_HALO).collect(),
+                    columns: spans(width / 32, columns, EXACT_HALO).collect(),
                 };
                 let (tall, wide) = other.largest();
                 let fits = (tall * wide) as u64 <= available;
                 assert!(!fits || other.computed_pixels() >= found.computed_pixels());
             }
+        }
+    }
+
+    /// The largest halo is an image's side: nothing wraps.
+    #[test]
+    fn a_huge_halo_is_the_whole_image() {
+        for halo in [MAX_SIDE, usize::MAX - 31, usize::MAX] {
+            let tiling = Tiling {
+                halo,
+                ..Tiling::default()
+            };
+            let error = plan((736, 1280), tiling, 736 * 1280 - 1).expect_err("no tile is smaller");
+            assert_eq!(error.tile, 1280);
         }
     }
 

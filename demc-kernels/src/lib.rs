@@ -36,4 +36,4 @@ mod testing;
 
 pub use grid::Grid;
 pub use isa::Isa;
-pub use tasks::within_pool;
+pub use tasks::{start_threads, within_pool};

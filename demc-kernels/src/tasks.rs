@@ -20,6 +20,16 @@ pub(crate) fn streaming(isa: Isa) -> Isa {
     if isa == Isa::Avx512 { Isa::Avx2 } else { isa }
 }
 
+/// Starts this number of threads for all kernels of the process. Without it, rayon starts them at the
+/// first use, as many as `RAYON_NUM_THREADS` asks for.
+///
+/// # Errors
+/// The threads run already, or the system cannot start them.
+pub fn start_threads(count: usize) -> Result<(), rayon::ThreadPoolBuildError> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(count);
+    pool.build_global()
+}
+
 /// Runs `work`, such as a whole training run, on one of the kernels' threads. From another thread,
 /// every kernel hands its work over and waits. These two wake-ups per kernel cost a tenth of a
 /// training step at C = 16.

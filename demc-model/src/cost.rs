@@ -6,6 +6,13 @@ use crate::weights::{Role, Stage, WeightSpec};
 /// Floating-point operations of a multiplication with its addition.
 const MULTIPLY_ADD: f64 = 2.0;
 
+/// Values in memory at the peak of a training step per output value of a kernel. Measured:
+/// `demc-train/tests/memory.rs`.
+const MAPS_KEPT: f64 = 1.5;
+
+/// Values in memory per weight: the weight, its gradient and two moments.
+const WEIGHT_COPIES: u64 = 4;
+
 impl ModelConfig {
     /// Number of trainable values.
     pub fn parameter_count(&self) -> u64 {
@@ -26,6 +33,25 @@ impl ModelConfig {
             .sum()
     }
 
+    /// Bytes that a training step of the kernels needs for this number of patches of `side` x `side`
+    /// pixels, in addition to their own planes: maps, weights, gradients and moments. An estimate,
+    /// to about a third.
+    pub fn step_bytes(&self, patches: usize, side: usize) -> u64 {
+        let specs = self.weight_specs();
+        let maps = specs.iter().filter_map(|spec| {
+            let level = match spec.stage {
+                // At the resolution of its output.
+                Stage::Decoder { level } => level,
+                _ => level_of(spec),
+            };
+            Some(spec.rows()? as f64 * 0.25f64.powi(level as i32))
+        });
+        let pixels = patches as f64 * (side * side) as f64;
+        let values = MAPS_KEPT * maps.sum::<f64>() * pixels;
+        let states = WEIGHT_COPIES * self.parameter_count();
+        (values as u64 + states) * size_of::<f32>() as u64
+    }
+
     /// The width with the number of trainable values that is nearest to `parameters`.
     pub fn width_for(&self, parameters: u64) -> usize {
         let widths = 1..=crate::config::MAX_WIDTH;
@@ -40,16 +66,20 @@ impl ModelConfig {
     }
 }
 
-/// The pixels to which a kernel is applied, as a share of the image's. Each level has a quarter of
-/// the pixels of the level above. A deconvolution is applied to the level below its own.
-fn share_of_pixels(spec: &WeightSpec) -> f64 {
-    let level = match spec.stage {
+/// The level of a kernel's input. A deconvolution is applied to the level below its own.
+fn level_of(spec: &WeightSpec) -> usize {
+    match spec.stage {
         Stage::Fusion => 0,
         Stage::Encoder { level, .. } | Stage::Head { level } => level,
         Stage::Latent => LEVELS,
         Stage::Decoder { level } => level + usize::from(spec.role == Role::Deconvolution),
-    };
-    0.25f64.powi(level as i32)
+    }
+}
+
+/// The pixels to which a kernel is applied, as a share of the image's. Each level has a quarter of
+/// the pixels of the level above.
+fn share_of_pixels(spec: &WeightSpec) -> f64 {
+    0.25f64.powi(level_of(spec) as i32)
 }
 
 #[cfg(test)]

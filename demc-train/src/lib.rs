@@ -9,6 +9,7 @@
 //! - [`record`] writes metrics, TensorBoard events and the progress bar.
 //! - [`tools`] compares variants, finds learning rates and draws charts.
 //! - [`usage`] has the error of a wrong command line.
+#![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod config;
 pub mod record;

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use demc_data::doctor::{Affected, Problem, Report, examine};
+use demc_data::message::{self, printable};
 
 /// Scenes that are named for a problem; the others are counted.
 const NAMED: usize = 4;
@@ -19,8 +20,8 @@ pub fn run(root: &Path, layout: Option<&str>, patch_size: usize, json: bool) -> 
         );
     }
     let report = examine(root, layout, patch_size)?;
-    super::print(&match json {
-        true => serde_json::to_string_pretty(&report)? + "\n",
+    message::result(&match json {
+        true => message::json(&report)?,
         false => lines(&report),
     })?;
     Ok(match report.problems.is_empty() {
@@ -33,7 +34,7 @@ fn lines(report: &Report) -> String {
     let mut text = String::new();
     for problem in &report.problems {
         // Writing to a String cannot fail.
-        let _ = writeln!(text, "{}", super::printable(&line(problem)));
+        let _ = writeln!(text, "{}", printable(&line(problem)));
     }
     let scenes = match report.scenes {
         1 => "1 scene".to_owned(),
@@ -44,8 +45,8 @@ fn lines(report: &Report) -> String {
         1 => "1 problem".to_owned(),
         problems => format!("{problems} problems"),
     };
-    let layout = super::printable(&report.layout);
-    let _ = writeln!(text, "{scenes} with layout {layout}: {problems}.");
+    let layout = printable(&report.layout);
+    let _ = write!(text, "{scenes} with layout {layout}: {problems}.");
     text
 }
 

@@ -10,13 +10,14 @@ use demc_data::dataset::FORMAT;
 use demc_data::exr::ExrFile;
 use demc_data::frame::{Presence, check_open_header};
 use demc_data::layout::{MissingPolicies, detect};
+use demc_data::message::{self, printable};
 use demc_data::output::{Directories, Outputs};
 use demc_data::{ChannelLayout, Split, file};
 use glob::Pattern;
 use regex_lite::Regex;
 use serde_json::{Map, Value, json};
 
-use super::{IndexArguments, UsageError, printable};
+use super::{IndexArguments, UsageError};
 
 /// Problems that an error names; the others are counted.
 const PROBLEMS_LISTED: usize = 8;
@@ -77,7 +78,8 @@ pub fn run(args: &IndexArguments) -> Result<()> {
     keys.insert("scenes".to_owned(), Value::Array(entries));
     let text = serde_json::to_string_pretty(&keys)? + "\n";
     file::write_whole(&manifest, |writer| writer.write_all(text.as_bytes()))?;
-    super::print(&(printable(&summary) + "\n"))
+    message::status(printable(&summary));
+    Ok(())
 }
 
 /// The manifest that is replaced.
@@ -161,7 +163,7 @@ fn exr_files(root: &Path) -> Result<(Vec<PathBuf>, usize)> {
             let kind = entry.file_type().ok();
             if kind.is_some_and(|kind| kind.is_dir()) && !hidden {
                 directories.push(relative);
-            } else if is_exr && !hidden && fs::metadata(entry.path()).is_ok_and(|m| m.is_file()) {
+            } else if is_exr && !hidden && !entry.path().is_dir() {
                 files.push(relative);
             } else if relative != Path::new("manifest.json") {
                 ignored += 1;

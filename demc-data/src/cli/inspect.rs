@@ -7,6 +7,7 @@ use std::process::ExitCode;
 use anyhow::Result;
 use demc_data::channel::{Channel, ChannelType};
 use demc_data::exr::ExrFile;
+use demc_data::message::{self, printable};
 use demc_data::plane::Plane;
 use serde::Serialize;
 
@@ -30,8 +31,8 @@ struct SampleRange {
 }
 
 #[derive(Serialize)]
-struct FileReport<'a> {
-    file: &'a Path,
+struct FileReport {
+    file: String,
     channels: Vec<ChannelRow>,
 }
 
@@ -49,15 +50,16 @@ pub fn run(files: &[PathBuf], json: bool) -> Result<ExitCode> {
                 continue;
             }
         };
+        let file = file.display().to_string();
         let report = FileReport { file, channels };
         if json {
             reports.push(report);
         } else {
-            super::print(&table(&report))?;
+            message::result(&table(&report))?;
         }
     }
     if json {
-        super::print(&(serde_json::to_string_pretty(&reports)? + "\n"))?;
+        message::result(&message::json(&reports)?)?;
     }
     Ok(status)
 }
@@ -96,7 +98,7 @@ fn row(channel: &Channel, plane: &Plane) -> ChannelRow {
     }
 }
 
-fn table(report: &FileReport<'_>) -> String {
+fn table(report: &FileReport) -> String {
     let rows = &report.channels;
     let longest = |text: fn(&ChannelRow) -> &str, title: &str| {
         rows.iter()
@@ -107,14 +109,14 @@ fn table(report: &FileReport<'_>) -> String {
     };
     let name_width = longest(|row| &row.name, "channel");
     let size_width = longest(|row| &row.size, "size");
-    let mut text = format!("{}: {} channels", report.file.display(), rows.len());
-    let mut layers: Vec<&str> = rows.iter().filter_map(|row| row.layer.as_deref()).collect();
+    let mut text = format!("{}: {} channels", printable(&report.file), rows.len());
+    let mut layers: Vec<String> = rows.iter().filter_map(|row| row.layer.clone()).collect();
     layers.dedup();
     if !layers.is_empty() {
         // Writing to a String cannot fail.
-        let _ = write!(text, ", layers {}", layers.join(", "));
+        let _ = write!(text, ", layers {}", message::list(&layers));
     }
-    let _ = writeln!(
+    let _ = write!(
         text,
         "\n  {:name_width$}  {:5}  {:size_width$}  {:>11}  {:>11}  {:>11}  {:>7}",
         "channel", "type", "size", "min", "max", "mean", "NaN/inf"
@@ -126,9 +128,9 @@ fn table(report: &FileReport<'_>) -> String {
             }
             None => ["-"; 3].map(str::to_owned),
         };
-        let _ = writeln!(
+        let _ = write!(
             text,
-            "  {:name_width$}  {:5}  {:size_width$}  {min:>11}  {max:>11}  {mean:>11}  {:>7}",
+            "\n  {:name_width$}  {:5}  {:size_width$}  {min:>11}  {max:>11}  {mean:>11}  {:>7}",
             row.name, row.kind, row.size, row.non_finite
         );
     }

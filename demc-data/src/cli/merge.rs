@@ -6,9 +6,10 @@ use std::path::PathBuf;
 use anyhow::Result;
 use demc_data::exr::ExrFile;
 use demc_data::exr::merge::{MergeInput, merge};
+use demc_data::message::{self, printable};
 use demc_data::output::{Directories, Outputs};
 
-use super::{MergeArguments, UsageError, printable};
+use super::{MergeArguments, UsageError};
 
 /// A file argument: `FILE` or `NAME=FILE`.
 #[derive(Debug, PartialEq, Eq)]
@@ -54,15 +55,19 @@ pub fn run(args: &MergeArguments) -> Result<()> {
     let merged = merge(&mut inputs, output)?;
     if !merged.conflicts.is_empty() {
         let names = merged.conflicts.join(", ");
-        eprintln!("note: the files differ in {names}; the first value is kept");
+        message::say(format_args!(
+            "note: the files differ in {names}; the first value is kept"
+        ));
     }
-    super::print(&format!(
-        "{}: {} channels of {} files: {}\n",
+    let summary = format!(
+        "{}: {} channels of {} files: {}",
         output.display(),
         merged.channels.len(),
         inputs.len(),
         merged.channels.join(", ")
-    ))
+    );
+    message::status(printable(&summary));
+    Ok(())
 }
 
 impl Source {

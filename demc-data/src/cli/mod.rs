@@ -8,13 +8,12 @@ mod stats;
 
 use std::ffi::OsString;
 use std::fmt;
-use std::io::{ErrorKind, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 use clap::{Args, Parser, Subcommand};
-use demc_data::Split;
+use demc_data::{Split, message};
 
 /// Prepares and inspects images and data sets for training a DEMC denoiser.
 ///
@@ -185,14 +184,9 @@ impl fmt::Display for UsageError {
 
 impl std::error::Error for UsageError {}
 
-/// Text from a file or an argument, safe to print in one line.
-fn printable(text: &str) -> String {
-    text.replace(char::is_control, "\u{fffd}")
-}
-
 /// Prints an error as one line on standard error.
 pub fn report(error: &anyhow::Error) {
-    eprintln!("{}", printable(&format!("error: {error:#}")));
+    message::say(format_args!("error: {error:#}"));
 }
 
 fn parse_split(text: &str) -> Result<Split, String> {
@@ -200,14 +194,6 @@ fn parse_split(text: &str) -> Result<Split, String> {
         "train" => Ok(Split::Train),
         "test" => Ok(Split::Test),
         _ => Err("expected train or test".to_owned()),
-    }
-}
-
-/// Prints to standard output; the reader may close it early.
-fn print(text: &str) -> Result<()> {
-    match std::io::stdout().write_all(text.as_bytes()) {
-        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
-        result => result.context("cannot write to standard output"),
     }
 }
 

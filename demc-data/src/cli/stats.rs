@@ -6,6 +6,7 @@ use std::path::Path;
 
 use anyhow::Result;
 use demc_data::frame::FEATURE_NAMES;
+use demc_data::message::{self, printable};
 use demc_data::patch::patches;
 use demc_data::{ChannelLayout, DataConfig, Dataset, Scene, Split, Statistics};
 use serde::Serialize;
@@ -15,7 +16,7 @@ const RELMSE_EPSILON: f32 = 0.001;
 
 #[derive(Serialize)]
 struct DatasetReport<'a> {
-    root: &'a Path,
+    root: String,
     layout: &'a str,
     splits: BTreeMap<Split, SplitContents>,
     /// The split of the measurements below.
@@ -65,7 +66,7 @@ pub fn run(root: &Path, layout_name: &str, split: Split, json: bool) -> Result<(
         .into_iter()
         .zip(normalizer.features.std);
     let report = DatasetReport {
-        root,
+        root: root.display().to_string(),
         layout: layout_name,
         splits: splits.collect(),
         split,
@@ -79,11 +80,11 @@ pub fn run(root: &Path, layout_name: &str, split: Split, json: bool) -> Result<(
             .collect(),
         flat_color: normalizer.flat_color,
     };
-    if json {
-        super::print(&(serde_json::to_string_pretty(&report)? + "\n"))
-    } else {
-        super::print(&table(&report, &config))
-    }
+    let text = match json {
+        true => message::json(&report)?,
+        false => table(&report, &config),
+    };
+    Ok(message::result(&text)?)
 }
 
 fn contents(scenes: &[Scene], config: &DataConfig) -> SplitContents {
@@ -104,7 +105,8 @@ fn contents(scenes: &[Scene], config: &DataConfig) -> SplitContents {
 }
 
 fn table(report: &DatasetReport<'_>, config: &DataConfig) -> String {
-    let mut text = format!("{} (layout {})\n", report.root.display(), report.layout);
+    let title = format!("{} (layout {})", report.root, report.layout);
+    let mut text = printable(&title) + "\n";
     // Writing to a String cannot fail.
     for (split, contents) in &report.splits {
         let sizes: Vec<String> = contents
@@ -127,7 +129,7 @@ fn table(report: &DatasetReport<'_>, config: &DataConfig) -> String {
             size = config.patch_size,
         );
         let bases: Vec<&str> = contents.base_scenes.iter().map(String::as_str).collect();
-        let _ = writeln!(text, "         {}", bases.join(", "));
+        let _ = writeln!(text, "         {}", printable(&bases.join(", ")));
     }
     let _ = writeln!(
         text,
@@ -146,7 +148,7 @@ fn table(report: &DatasetReport<'_>, config: &DataConfig) -> String {
         let _ = writeln!(text, "  {name:10}  {mean:>11}  {std:>11}");
     }
     let [r, g, b] = report.flat_color;
-    let _ = writeln!(
+    let _ = write!(
         text,
         "  flat colour with the least RelMSE, in gamma space: {r:.4} {g:.4} {b:.4}"
     );

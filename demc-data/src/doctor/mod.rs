@@ -88,9 +88,11 @@ pub fn examine(root: &Path, layout: Option<&str>, patch_size: usize) -> Result<R
     let layout = ChannelLayout::resolve(name)?;
 
     let mut findings = set::of_manifest(&scenes);
-    let examined = parallel::map(parallel::available(), scenes.iter().collect(), |scene| {
-        scene::examine(scene, &layout, patch_size)
-    });
+    let examined = parallel::map(
+        parallel::threads().count,
+        scenes.iter().collect(),
+        |scene| scene::examine(scene, &layout, patch_size),
+    );
     let mut measured = Vec::with_capacity(scenes.len());
     for (scene, (own, image)) in scenes.iter().zip(examined) {
         findings.extend(own);

@@ -15,7 +15,7 @@ use ::exr::meta::{BlockDescription, MetaData, compute_block_count};
 use ::exr::prelude::Vec2;
 
 use super::decode::{check_density, decompress};
-use super::{MAX_PIXELS, MAX_SIDE, invalid};
+use super::{check_size, invalid};
 use crate::parallel;
 
 /// Bytes of pixels that are decoded or encoded at once, but at least one block per thread (ours:
@@ -68,7 +68,10 @@ impl<R: Read + Seek> BlockReader<R> {
             return Err(invalid("it is empty".to_owned()));
         }
         let meta = ::exr::block::read(&mut reader, false)?.into_meta_data();
-        meta.headers.iter().try_for_each(check_size)?;
+        for header in &meta.headers {
+            let Vec2(width, height) = header.layer_size;
+            check_size(width, height).map_err(|error| invalid(error.to_string()))?;
+        }
         let tables = reader.stream_position()?;
         let counts = meta.headers.iter().map(|header| header.chunk_count as u64);
         let blocks = counts.fold(tables, |sum, count| {
@@ -85,7 +88,7 @@ impl<R: Read + Seek> BlockReader<R> {
             tables,
             blocks,
             length,
-            threads: parallel::available(),
+            threads: parallel::threads().count,
             kept: DecodedBlocks::default(),
         })
     }
@@ -293,15 +296,4 @@ fn integer(reader: &mut impl Read) -> Result<i32, ExrError> {
     let mut bytes = [0; 4];
     reader.read_exact(&mut bytes)?;
     Ok(i32::from_le_bytes(bytes))
-}
-
-fn check_size(header: &Header) -> Result<(), ExrError> {
-    let Vec2(width, height) = header.layer_size;
-    let sides = 1..=MAX_SIDE;
-    if sides.contains(&width) && sides.contains(&height) && width * height <= MAX_PIXELS {
-        return Ok(());
-    }
-    Err(invalid(format!(
-        "its size is {width}x{height}, not 1x1 to {MAX_SIDE}x{MAX_SIDE} with at most {MAX_PIXELS} pixels"
-    )))
 }

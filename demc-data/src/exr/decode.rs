@@ -64,18 +64,15 @@ pub(super) struct SampleSpan {
 }
 
 impl SampleSpan {
-    /// The location of the channel with this index.
-    ///
-    /// # Panics
-    /// If the part has no such channel.
-    pub(super) fn of(list: &ChannelList, index: usize) -> Self {
-        let mut channels = list.channels_with_byte_offset();
-        let (before, channel) = channels.nth(index).expect("a channel of the part");
-        Self {
+    /// The locations of all channels of a part, in its order.
+    pub(super) fn all(list: &ChannelList) -> Vec<Self> {
+        let channels = list.channels_with_byte_offset();
+        let spans = channels.map(|(before, channel)| Self {
             pixel: list.bytes_per_pixel,
             before,
             sample: channel.sample_type.bytes_per_sample(),
-        }
+        });
+        spans.collect()
     }
 
     /// The channel's bytes of a line in a block; `y` counts from the top of the image.

@@ -17,6 +17,7 @@ use super::recode::{OutputBlock, compress, sort_attributes, targets};
 use super::write::io_error;
 use super::{Compression, ExrFile, guarded, invalid};
 use crate::channel::Channel;
+use crate::message::printable;
 use crate::plane::Plane;
 use crate::{Error, file, parallel};
 
@@ -191,7 +192,7 @@ fn joined_header<R: Read + Seek>(
                 Some((_, other)) if *other == value => {}
                 Some(_) => {
                     let name = String::from_utf8_lossy(name);
-                    conflicts.push(name.replace(char::is_control, "\u{fffd}"));
+                    conflicts.push(printable(&name));
                 }
             }
         }

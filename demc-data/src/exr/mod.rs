@@ -48,6 +48,30 @@ pub const MAX_SIDE: usize = 32_768;
 /// memory.
 pub const MAX_PIXELS: usize = 1 << 27;
 
+/// An image that is empty or exceeds [`MAX_SIDE`] or [`MAX_PIXELS`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "its size is {width}x{height}, not 1x1 to {MAX_SIDE}x{MAX_SIDE} with at most {MAX_PIXELS} pixels"
+)]
+pub struct UnsupportedSize {
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+}
+
+/// Checks the size of an image in pixels. Files, frames in memory and tiles have this one limit.
+///
+/// # Errors
+/// The image is empty or too large.
+pub fn check_size(width: usize, height: usize) -> Result<(), UnsupportedSize> {
+    let sides = 1..=MAX_SIDE;
+    match sides.contains(&width) && sides.contains(&height) && width * height <= MAX_PIXELS {
+        true => Ok(()),
+        false => Err(UnsupportedSize { width, height }),
+    }
+}
+
 /// The hint for a file with unsupported features.
 const SUPPORTED: &str =
     "expected OpenEXR 2 with scan lines or tiles, neither deep nor subsampled, not HTJ2K";

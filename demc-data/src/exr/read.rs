@@ -1,5 +1,6 @@
 //! The headers of a file and, on demand, its channels.
 
+use std::collections::{BTreeSet, HashMap};
 use std::fs::{self, File};
 use std::io::{self, BufReader, Read, Seek};
 use std::path::{Path, PathBuf};
@@ -13,17 +14,22 @@ use half::f16;
 
 use super::blocks::{BlockPosition, BlockReader, DecodedBlocks};
 use super::decode::SampleSpan;
-use super::{guarded, invalid};
+use super::guarded;
 use crate::channel::{Channel, ChannelType, Window, full_name};
 use crate::parallel;
 use crate::plane::Plane;
 use crate::{ChannelLayout, Error};
+
+/// Memory that must be free for blocks while pixels are decoded, in bytes (ours: four batches).
+const SPARE_BYTES: usize = 32 << 20;
 
 /// An open file whose headers are read and checked; its pixels are not yet decoded.
 pub struct ExrFile<R = BufReader<File>> {
     path: PathBuf,
     pub(super) source: BlockReader<R>,
     channels: Vec<Channel>,
+    /// The first channel of each name, as an index into `channels`.
+    by_name: HashMap<String, usize>,
 }
 
 impl ExrFile {
@@ -60,9 +66,15 @@ impl<R: Read + Seek> ExrFile<R> {
         let several = headers.len() > 1;
         let parts = headers.iter().enumerate();
         let channels = parts.flat_map(|(part, header)| channels_of(part, header, several));
+        let channels: Vec<Channel> = channels.collect();
+        let mut by_name = HashMap::with_capacity(channels.len());
+        for (index, channel) in channels.iter().enumerate() {
+            by_name.entry(channel.name.clone()).or_insert(index);
+        }
         Ok(Self {
             path: path.to_owned(),
-            channels: channels.collect(),
+            channels,
+            by_name,
             source,
         })
     }
@@ -79,7 +91,7 @@ impl<R: Read + Seek> ExrFile<R> {
 
     /// The channel with this name; the first one if there are several.
     pub fn channel(&self, name: &str) -> Option<&Channel> {
-        self.channels.iter().find(|channel| channel.name == name)
+        self.by_name.get(name).map(|index| &self.channels[*index])
     }
 
     /// Checks that the file has all these channels.
@@ -129,8 +141,8 @@ impl<R: Read + Seek> ExrFile<R> {
     /// read.
     ///
     /// # Errors
-    /// [`Error::MissingChannels`] if the file lacks any; [`Error::Exr`] if the pixel data is
-    /// truncated or damaged, or memory is insufficient.
+    /// [`Error::MissingChannels`] if the file lacks any; [`Error::Memory`]; [`Error::Exr`] if the
+    /// pixel data is truncated or damaged.
     pub fn read(&mut self, names: &[&str]) -> Result<Vec<Plane>, Error> {
         self.require(names)?;
         let wanted: Vec<Channel> = names
@@ -138,7 +150,41 @@ impl<R: Read + Seek> ExrFile<R> {
             .filter_map(|name| self.channel(name))
             .cloned()
             .collect();
-        guarded(&self.path, || decode(&mut self.source, &wanted))
+        let mut planes: Vec<Plane> = wanted.iter().map(|channel| empty(channel.kind)).collect();
+        // A file that cannot hold its pixels is damaged, whatever memory there is.
+        guarded(&self.path, || {
+            let parts: BTreeSet<usize> = wanted.iter().map(|channel| channel.part).collect();
+            let mut parts = parts.into_iter();
+            parts.try_for_each(|part| self.source.grid(part).map(drop))
+        })?;
+        self.reserve(&wanted, &mut planes)?;
+        guarded(&self.path, || {
+            decode(&mut self.source, &wanted, &mut planes)
+        })?;
+        Ok(planes)
+    }
+
+    /// Reserves address space for whole planes; memory is used as rows are filled.
+    fn reserve(&self, wanted: &[Channel], planes: &mut [Plane]) -> Result<(), Error> {
+        let pixels = |channel: &Channel| channel.window.width * channel.window.height;
+        let reserved = wanted
+            .iter()
+            .zip(planes)
+            .try_for_each(|(channel, plane)| match plane {
+                Plane::Half(plane) => plane.try_reserve_exact(pixels(channel)),
+                Plane::Float(plane) => plane.try_reserve_exact(pixels(channel)),
+                Plane::Uint(plane) => plane.try_reserve_exact(pixels(channel)),
+            });
+        // The decoder cannot report that its blocks have no room.
+        let spare = reserved.and_then(|()| Vec::<u8>::new().try_reserve_exact(SPARE_BYTES));
+        let bytes = |channel: &Channel| match channel.kind {
+            ChannelType::Half => 2 * pixels(channel),
+            ChannelType::Float | ChannelType::Uint => 4 * pixels(channel),
+        };
+        spare.map_err(|_| Error::Memory {
+            path: self.path.clone(),
+            needed: wanted.iter().map(bytes).sum::<usize>().div_ceil(1 << 20),
+        })
     }
 }
 
@@ -163,7 +209,7 @@ fn channels_of(part: usize, header: &Header, several: bool) -> Vec<Channel> {
     channels.collect()
 }
 
-/// A name from the file, safe to print in a one-line message on a terminal.
+/// A name from the file, as a layout must spell it.
 pub(super) fn printable(name: &Text) -> String {
     let name = String::from_utf8_lossy(name.bytes());
     name.replace(char::is_control, "\u{fffd}")
@@ -173,8 +219,8 @@ pub(super) fn printable(name: &Text) -> String {
 fn decode<R: Read + Seek>(
     source: &mut BlockReader<R>,
     wanted: &[Channel],
-) -> Result<Vec<Plane>, ExrError> {
-    let mut planes: Vec<Plane> = wanted.iter().map(|channel| empty(channel.kind)).collect();
+    planes: &mut [Plane],
+) -> Result<(), ExrError> {
     for part in 0..source.meta.headers.len() {
         if !wanted.iter().any(|channel| channel.part == part) {
             continue;
@@ -182,12 +228,11 @@ fn decode<R: Read + Seek>(
         let grid = source.grid(part)?;
         let header = &source.meta.headers[part];
         let rows = source.batch(header).div_ceil(grid.columns);
+        let spans = SampleSpan::all(&header.channels);
         let mut part_channels = Vec::with_capacity(wanted.len());
-        for (channel, plane) in wanted.iter().zip(&mut planes) {
+        for (channel, plane) in wanted.iter().zip(&mut *planes) {
             if channel.part == part {
-                reserve(plane, channel.window)?;
-                let span = SampleSpan::of(&header.channels, channel.index);
-                part_channels.push((channel.window, span, plane));
+                part_channels.push((channel.window, spans[channel.index], plane));
             }
         }
         for top in (0..grid.rows).step_by(rows) {
@@ -206,7 +251,7 @@ fn decode<R: Read + Seek>(
             source.kept.keep(part, &places, blocks);
         }
     }
-    Ok(planes)
+    Ok(())
 }
 
 /// Copies a channel's samples from a block to their positions in an image of this width.
@@ -237,17 +282,6 @@ fn empty(kind: ChannelType) -> Plane {
         ChannelType::Float => Plane::Float(Vec::new()),
         ChannelType::Uint => Plane::Uint(Vec::new()),
     }
-}
-
-/// Reserves address space for a whole plane; memory is used as rows are filled.
-fn reserve(plane: &mut Plane, window: Window) -> Result<(), ExrError> {
-    let samples = window.width * window.height;
-    let reserved = match plane {
-        Plane::Half(plane) => plane.try_reserve_exact(samples),
-        Plane::Float(plane) => plane.try_reserve_exact(samples),
-        Plane::Uint(plane) => plane.try_reserve_exact(samples),
-    };
-    reserved.map_err(|_| invalid(format!("no memory for a channel of {window}")))
 }
 
 fn grow(plane: &mut Plane, samples: usize) {

@@ -240,9 +240,10 @@ struct CarriedChannels {
 
 impl CarriedChannels {
     fn new(part: usize, grid: BlockGrid, input: &Header, origins: &[ChannelOrigin]) -> Self {
+        let spans = SampleSpan::all(&input.channels);
         let content = |origin: &ChannelOrigin| match origin.plane {
             Some(plane) => ChannelContent::Color(plane),
-            None => ChannelContent::Carried(SampleSpan::of(&input.channels, origin.index)),
+            None => ChannelContent::Carried(spans[origin.index]),
         };
         Self {
             part,

@@ -6,9 +6,7 @@ use std::io::{Read, Seek};
 use super::{ANY_LAYER, ChannelLayout, Missing, MissingPolicies, PRESETS, Triple};
 use crate::Error;
 use crate::exr::ExrFile;
-
-/// Number of channels that a message shows.
-const SHOWN: usize = 20;
+use crate::message::list;
 
 /// A preset that fits a file.
 #[derive(Debug, Clone, PartialEq)]
@@ -63,11 +61,11 @@ impl ChannelLayout {
                 .expect_err("a name with `*` is in no file")),
             (Some(layer), all) => Err(problem(
                 file,
-                format!("no view layer {layer:?}; there is {}", all.join(", ")),
+                format!("no view layer {layer:?}; there is {}", list(all)),
             )),
             (None, all) => Err(problem(
                 file,
-                format!("view layers {}: choose one", all.join(", ")),
+                format!("view layers {}: choose one", list(all)),
             )),
         }
     }
@@ -141,7 +139,7 @@ pub fn detect<R: Read + Seek>(
         let layers = match (pattern.has_any_layer(), layer) {
             (true, Some(layer)) => {
                 if !found.is_empty() && !found.iter().any(|name| name == layer) {
-                    let found = found.join(", ");
+                    let found = list(&found);
                     return Err(problem(
                         file,
                         format!("no view layer {layer:?}; there is {found}"),
@@ -177,8 +175,8 @@ pub fn detect<R: Read + Seek>(
     match fits.len() {
         1 => Ok(fits.remove(0)),
         0 if nearest.0 == 0 => {
-            let names = file.channels().iter().map(|channel| &*channel.name);
-            let names = names.take(SHOWN).collect::<Vec<_>>().join(", ");
+            let names = file.channels().iter().map(|channel| channel.name.clone());
+            let names = list(&names.collect::<Vec<_>>());
             Err(problem(
                 file,
                 format!("no preset has any of its channels: {names}"),
@@ -186,7 +184,7 @@ pub fn detect<R: Read + Seek>(
         }
         0 => {
             let (_, preset, lacking) = nearest;
-            let lacking = lacking.join(", ");
+            let lacking = list(&lacking);
             Err(problem(
                 file,
                 format!("no preset fits; the nearest, {preset}, lacks {lacking}"),
@@ -197,7 +195,7 @@ pub fn detect<R: Read + Seek>(
                 Some(layer) => format!("{} with view layer {layer:?}", fit.preset),
                 None => fit.preset.to_owned(),
             });
-            let names = names.collect::<Vec<_>>().join(", ");
+            let names = list(&names.collect::<Vec<_>>());
             Err(problem(
                 file,
                 format!("several presets fit equally well: {names}; choose one"),

@@ -8,10 +8,10 @@
 use std::path::Path;
 
 use demc_data::checksum::sha256;
+use demc_data::message::printable;
 use safetensors::SafeTensors;
 
 use super::BundleError;
-use super::tensors::one_line;
 
 /// File of a checkpoint with the checksums of its other files, as `sha256sum` writes it.
 pub const SUMS: &str = "SHA256SUMS";
@@ -87,7 +87,7 @@ pub fn sums(dir: &Path) -> Result<Vec<(String, String)>, BundleError> {
     let pairs = text.lines().map(|line| match line.split_once("  ") {
         Some((sum, name)) => Ok((sum.to_owned(), name.to_owned())),
         None => {
-            let line = one_line(line);
+            let line = printable(line);
             Err(invalid(format!(
                 "expected `CHECKSUM  FILE`, found `{line}`"
             )))
@@ -121,7 +121,7 @@ pub(super) fn check_in_checkpoint(path: &Path, bytes: &[u8]) -> Result<(), Bundl
         }),
         None => Err(BundleError::Sums {
             path: dir.join(SUMS),
-            detail: format!("does not list {}", one_line(&name.to_string_lossy())),
+            detail: format!("does not list {}", printable(&name.to_string_lossy())),
         }),
     }
 }

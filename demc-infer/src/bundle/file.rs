@@ -6,6 +6,7 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use demc_data::frame::FEATURE_NAMES;
+use demc_data::message::printable;
 use demc_model::kernel_head::GAMMA;
 use demc_model::{Head, Weight};
 use safetensors::SafeTensors;
@@ -15,7 +16,7 @@ use serde::de::IgnoredAny;
 
 use super::encode::KEY;
 use super::filter::FILTER_KEY;
-use super::tensors::{one_line, values};
+use super::tensors::values;
 use super::{BundleError, BundleMeta, FORMAT, Names, PREFIX, Precision, checksum, locate};
 
 /// Longest accepted header in bytes (ours: the widest network's has 20 kB).
@@ -87,7 +88,7 @@ impl BundleFile {
             }
             let data = values(&view).map_err(|detail| BundleError::Tensor {
                 path: path.clone(),
-                name: one_line(name),
+                name: printable(name),
                 detail,
             })?;
             let (weights, specs, name) = match (name.strip_prefix(PREFIX), &mut filter_specs) {
@@ -97,7 +98,7 @@ impl BundleFile {
             weights.push(Weight {
                 name: match specs.remove(name) {
                     Some(spec) => spec.name,
-                    None => one_line(name),
+                    None => printable(name),
                 },
                 shape: view.shape().to_vec(),
                 data,
@@ -163,7 +164,7 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>, BundleError> {
 pub(super) fn damaged(path: &Path, error: &safetensors::SafeTensorError) -> BundleError {
     BundleError::Damaged {
         path: path.into(),
-        detail: one_line(&error.to_string()),
+        detail: printable(&error.to_string()),
     }
 }
 
@@ -200,7 +201,7 @@ fn parse_header(entry: &str, path: &Path) -> Result<BundleHeader, BundleError> {
     }
     let invalid = |detail: String| BundleError::Header {
         path: path.into(),
-        detail: one_line(&detail),
+        detail: printable(&detail),
     };
     let meta = parse_network(entry, path, &HEADER_KEYS, &invalid)?;
     let rest = serde_json::from_str(entry).map_err(|error| invalid(error.to_string()))?;

@@ -3,12 +3,13 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use demc_data::message::printable;
 use demc_model::{ModelConfig, Role, Weight, WeightSpec};
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 
 use super::file::{damaged, parse_meta, read};
-use super::tensors::{one_line, values};
+use super::tensors::values;
 use super::{BundleError, BundleFile, Names, PREFIX, Precision};
 
 /// Invalid tensors by kind of problem.
@@ -115,7 +116,7 @@ impl BundleFile {
         let mut tensors = Tensors {
             found: file
                 .iter()
-                .map(|(name, view)| (one_line(name), view))
+                .map(|(name, view)| (printable(name), view))
                 .collect(),
             problems: TensorProblems::default(),
             precision: Precision::F32,

@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 
+use demc_data::message::printable;
 use demc_model::Weight;
 use half::f16;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
@@ -65,16 +66,6 @@ pub(super) fn values(view: &TensorView<'_>) -> Result<Vec<f32>, String> {
     }
 }
 
-/// Text from a file with control characters escaped, so that it is one line and safe for a
-/// terminal.
-pub(super) fn one_line(text: &str) -> String {
-    let escape = |c: char| match c.is_control() {
-        true => c.escape_default().collect(),
-        false => c.to_string(),
-    };
-    text.chars().map(escape).collect()
-}
-
 /// The bytes of a file with f32 tensors and no metadata, for an optimizer's state.
 ///
 /// # Errors
@@ -98,10 +89,10 @@ pub fn to_bytes(weights: &[Weight]) -> Result<Vec<u8>, super::BundleError> {
 /// A message: the bytes are cut short or no safetensors file, or a tensor has a type other than f32
 /// and f16, NaN or infinity.
 pub fn from_bytes(bytes: &[u8]) -> Result<Vec<Weight>, String> {
-    let file = SafeTensors::deserialize(bytes).map_err(|error| one_line(&error.to_string()))?;
+    let file = SafeTensors::deserialize(bytes).map_err(|error| printable(&error.to_string()))?;
     let weights = file.tensors().into_iter().map(|(name, view)| {
         let data =
-            values(&view).map_err(|detail| format!("tensor {}: {detail}", one_line(&name)))?;
+            values(&view).map_err(|detail| format!("tensor {}: {detail}", printable(&name)))?;
         let shape = view.shape().to_vec();
         Ok(Weight { name, shape, data })
     });

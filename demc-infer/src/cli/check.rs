@@ -1,10 +1,11 @@
 //! `demc-infer check`: compares images with a model's training data.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use demc_data::exr::ExrFile;
 use demc_data::frame::{FEATURE_NAMES, TEXTURES, decode_input};
+use demc_data::message::{self, printable};
 use demc_data::noise::{CORRELATED, correlation};
 use demc_data::ranges::Range;
 use demc_data::transform::MAX_ALBEDO;
@@ -15,11 +16,12 @@ use serde::Serialize;
 use super::flags::{DeviceFlag, ModelFlag};
 use super::inputs::{Frames, Inputs};
 use super::layouts::{LayoutFlags, Layouts, say};
-use super::{Clamped, print, utf8_for_json};
+use super::{Clamped, utf8_for_json};
 
 /// Compare images with a model's training data: statistics of each channel, and warnings.
 ///
-/// `denoise` prints the same warnings. The exit code is 1 if an image has a warning.
+/// `denoise` prints the same warnings. The exit code is 1 if an image has a warning or
+/// cannot be read. JSON then has its error.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer check noisy.exr
@@ -42,9 +44,17 @@ pub struct Arguments {
     device: DeviceFlag,
 }
 
+/// An element of the JSON array.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Checked {
+    Image(FileCheck),
+    Failed { file: String, error: String },
+}
+
 #[derive(Serialize)]
 struct FileCheck {
-    file: PathBuf,
+    file: String,
     exposure: CheckedValue,
     input_scale: f32,
     channels: Vec<ChannelCheck>,
@@ -66,7 +76,7 @@ struct ChannelCheck {
 }
 
 impl Arguments {
-    /// Checks every image; an unreadable one ends the run.
+    /// Checks every image. Unreadable ones are reported.
     pub fn run(self) -> anyhow::Result<()> {
         let inputs = Inputs::expand(&self.inputs, self.frames)?;
         if self.json {
@@ -75,34 +85,56 @@ impl Arguments {
                 .iter()
                 .try_for_each(|file| utf8_for_json(file))?;
         }
+        let incomplete = inputs.report_missing();
         let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
         let mut all = Vec::with_capacity(inputs.files.len());
         let mut clamped = Clamped::default();
-        for path in inputs.files {
-            let (checked, negative) = FileCheck::new(path, &bundle, &layouts)?;
-            clamped.count(negative);
-            if !self.json {
-                print(&checked.text())?;
-            }
-            all.push(checked);
+        let (mut warned, mut failed) = (0, 0);
+        for path in &inputs.files {
+            all.push(match FileCheck::new(path, &bundle, &layouts) {
+                Ok((checked, negative)) => {
+                    clamped.count(negative);
+                    warned += usize::from(!checked.warnings.is_empty());
+                    if !self.json {
+                        message::result(&checked.text())?;
+                    }
+                    Checked::Image(checked)
+                }
+                Err(error) => {
+                    failed += 1;
+                    message::say(format_args!("error: {error:#}"));
+                    Checked::Failed {
+                        file: path.display().to_string(),
+                        error: format!("{error:#}"),
+                    }
+                }
+            });
         }
         if self.json {
-            print(&serde_json::to_string_pretty(&all)?)?;
+            message::result(&message::json(&all)?)?;
         }
         clamped.report();
-        let warned = all.iter().filter(|checked| !checked.warnings.is_empty());
-        match warned.count() {
-            0 => Ok(()),
-            warned => anyhow::bail!("{warned} of {} images have warnings", all.len()),
-        }
+        let images = all.len();
+        let problems = [
+            (
+                failed,
+                format!("{failed} of {images} images were not checked"),
+            ),
+            (warned, format!("{warned} of {images} images have warnings")),
+            (incomplete, format!("{incomplete} sequence(s) lack frames")),
+        ];
+        let problems = problems.into_iter().filter(|(count, _)| *count > 0);
+        let problems: Vec<String> = problems.map(|(_, problem)| problem).collect();
+        anyhow::ensure!(problems.is_empty(), "{}", problems.join("; "));
+        Ok(())
     }
 }
 
 impl FileCheck {
     /// Checks one file. Also returns its number of negative samples.
-    fn new(path: PathBuf, bundle: &Bundle, layouts: &Layouts) -> anyhow::Result<(Self, usize)> {
-        let mut file = ExrFile::open(&path)?;
+    fn new(path: &Path, bundle: &Bundle, layouts: &Layouts) -> anyhow::Result<(Self, usize)> {
+        let mut file = ExrFile::open(path)?;
         let layout = layouts.of(&file, bundle, say)?;
         let frame = decode_input(&mut file, &layout)?;
         let FrameSummary {
@@ -131,7 +163,7 @@ impl FileCheck {
             warnings.push(format!("`denoise` refuses this image: {refused}"));
         }
         let checked = Self {
-            file: path,
+            file: path.display().to_string(),
             exposure: row(exposure, ranges.map(|ranges| ranges.exposure)),
             input_scale: bundle.input_scale(exposure),
             channels: channels.collect(),
@@ -146,7 +178,7 @@ impl FileCheck {
             None => "unknown".into(),
         };
         let mut lines = vec![
-            self.file.display().to_string(),
+            printable(&self.file),
             format!(
                 "| {:<10} | {:>9} | {:>20} | {:>9} | {:>20} |",
                 "channel", "mean", "training scenes", "deviation", "training scenes"
@@ -184,7 +216,7 @@ impl FileCheck {
         lines.extend(
             self.warnings
                 .iter()
-                .map(|warning| format!("warning: {warning}")),
+                .map(|warning| format!("warning: {}", printable(warning))),
         );
         lines.join("\n") + "\n"
     }

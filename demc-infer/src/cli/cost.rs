@@ -3,15 +3,15 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use demc_data::exr::ExrFile;
+use demc_data::exr::{ExrFile, check_size};
 use demc_data::frame::{Presence, check_open_header};
+use demc_data::message;
 use demc_infer::{Bundle, Ensemble, Tiling, memory};
 use demc_model::{DOWNSAMPLING, ModelConfig};
 use serde::Serialize;
 
 use super::flags::{DeviceFlag, ModelFlag, TilingFlags, describe};
 use super::layouts::{LayoutFlags, say};
-use super::print;
 
 /// Show the cost of denoising: parameters, operations, memory and tiles. Nothing is denoised.
 #[derive(Args)]
@@ -27,7 +27,7 @@ pub struct Arguments {
     /// Images; only their headers are read
     #[arg(value_name = "IN.exr", required_unless_present = "sizes")]
     inputs: Vec<PathBuf>,
-    /// Image size in pixels. The flag can be repeated
+    /// Image size in pixels, as large as a file may be. The flag can be repeated
     #[arg(long = "size", value_name = "WxH", value_parser = size)]
     sizes: Vec<(usize, usize)>,
     #[command(flatten)]
@@ -39,18 +39,13 @@ pub struct Arguments {
     device: DeviceFlag,
 }
 
-/// Longest accepted side in pixels; a longer one is a typing error.
-const MAX_SIDE: usize = 1 << 17;
-
 fn size(text: &str) -> Result<(usize, usize), String> {
-    let side = |text: &str| {
-        let side = text.parse().ok();
-        side.filter(|side| (1..=MAX_SIDE).contains(side))
-    };
     let sides = text
         .split_once(['x', 'X'])
-        .and_then(|(w, h)| Some((side(w)?, side(h)?)));
-    sides.ok_or_else(|| format!("not WIDTHxHEIGHT with sides from 1 to {MAX_SIDE}"))
+        .and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+    let (width, height) = sides.ok_or("not WIDTHxHEIGHT in pixels")?;
+    check_size(width, height).map_err(|error| error.to_string())?;
+    Ok((width, height))
 }
 
 #[derive(Serialize)]
@@ -90,31 +85,43 @@ impl Arguments {
         let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
         let tiling = self.tiling.tiling();
-        let mut sizes = self.sizes;
-        for input in &self.inputs {
+        let read_size = |input: &PathBuf| -> anyhow::Result<(usize, usize)> {
             let file = ExrFile::open(input)?;
             let layout = layouts.of(&file, &bundle, say)?;
             let window = check_open_header(&file, &layout, Presence::Skip)?;
-            sizes.push((window.width, window.height));
+            Ok((window.width, window.height))
+        };
+        let sizes = self.sizes.iter().map(|size| Ok(*size));
+        let sizes = sizes.chain(self.inputs.iter().map(read_size));
+        let count = self.sizes.len() + self.inputs.len();
+        let mut images = Vec::with_capacity(count);
+        for size in sizes {
+            let cost = size.and_then(|(width, height)| Ok(image(&bundle, &tiling, width, height)?));
+            match cost {
+                Ok(cost) => images.push(cost),
+                Err(error) if count == 1 => return Err(error),
+                Err(error) => message::say(format_args!("error: {error:#}")),
+            }
         }
+        let failed = count - images.len();
         let config = bundle.model.config();
         let networks = bundle.networks();
         let parameters = networks.map(|network| network.meta.model.parameter_count());
         let parameters = parameters.sum();
-        let images = sizes
-            .into_iter()
-            .map(|(width, height)| image(&bundle, &tiling, width, height));
         let report = CostReport {
             network: *config,
             parameters,
             weight_bytes: parameters * size_of::<f32>() as u64,
             available_bytes: tiling.memory.or_else(|| bundle.memory_budget()),
-            images: images.collect::<Result<_, _>>()?,
+            images,
         };
-        print(&match self.json {
-            true => serde_json::to_string_pretty(&report)?,
+        let text = match self.json {
+            true => message::json(&report)?,
             false => report.text(),
-        })
+        };
+        message::result(&text)?;
+        anyhow::ensure!(failed == 0, "{failed} of {count} images have no cost");
+        Ok(())
     }
 }
 
@@ -185,7 +192,7 @@ mod tests {
     #[test]
     fn a_size_is_two_numbers() {
         assert_eq!(size("1280x720"), Ok((1280, 720)));
-        for wrong in ["1280", "0x5", "5x", "axb", "1x2x3", "999999x2"] {
+        for wrong in ["1280", "0x5", "5x", "axb", "1x2x3", "32769x2", "32768x4097"] {
             assert!(size(wrong).is_err(), "{wrong}");
         }
     }

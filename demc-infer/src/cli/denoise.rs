@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use demc_data::ChannelLayout;
 use demc_data::exr::rewrite::{OutputChannels, WriteOptions, rewrite};
 use demc_data::exr::{Compression, ExrFile};
 use demc_data::frame::{decode_input, decode_repaired};
 use demc_data::output::{Directories, Outputs};
+use demc_data::{ChannelLayout, message};
 use demc_infer::denoise::{DenoiseOptions, SeamError};
 use demc_infer::guard::{EnergyBias, Warning};
 use demc_infer::{Bundle, Picture, memory};
@@ -31,10 +31,11 @@ fn cache_bytes() -> usize {
     share.min(MAX_CACHE) as usize
 }
 
-/// Denoise OpenEXR images of any size.
+/// Denoise OpenEXR images of up to 32768 pixels a side and 134217728 pixels.
 ///
-/// Inputs are files, directories, glob patterns, or frame sequences. Failed inputs are reported and
-/// skipped, and the exit code is 1. Rerun the command to resume a partly finished directory.
+/// Inputs are files, directories, glob patterns, or frame sequences. Failed inputs and missing
+/// frames are reported and skipped, and the exit code is 1. Rerun the command to resume a partly
+/// finished directory.
 ///
 /// Channels have the names of the model's training data, or those that Mitsuba, pbrt, Blender
 /// Cycles or FBKSD write. --layout chooses other names. An image that differs from the training
@@ -102,6 +103,7 @@ pub struct Arguments {
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let inputs = Inputs::expand(&self.inputs, self.frames)?;
+        let incomplete = inputs.report_missing();
         let mut jobs = Jobs::new(&inputs, &self.output, self.png)?;
         let mut outputs = Outputs::default();
         self.model.protect(&mut outputs);
@@ -112,11 +114,15 @@ impl Arguments {
         }
         if jobs.skipped > 0 {
             let (done, all) = (jobs.skipped, jobs.skipped + jobs.list.len());
-            eprintln!("note: {done} of {all} images already exist; --overwrite replaces them");
+            message::say(format_args!(
+                "note: {done} of {all} images already exist; --overwrite replaces them"
+            ));
         }
         if jobs.kept_previews > 0 {
             let kept = jobs.kept_previews;
-            eprintln!("note: existing previews are kept: {kept}; --overwrite replaces them");
+            message::say(format_args!(
+                "note: existing previews are kept: {kept}; --overwrite replaces them"
+            ));
         }
         let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
@@ -148,7 +154,7 @@ impl Arguments {
         }
         progress.finish();
         for line in warnings.rest() {
-            eprintln!("warning: {line}");
+            message::say(format_args!("warning: {line}"));
         }
         clamped.report();
         anyhow::ensure!(
@@ -156,6 +162,7 @@ impl Arguments {
             "{failed} of {} images were not denoised",
             jobs.len()
         );
+        anyhow::ensure!(incomplete == 0, "{incomplete} sequence(s) lack frames");
         Ok(())
     }
 

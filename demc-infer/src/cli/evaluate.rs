@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use demc_data::message;
 use demc_infer::Report;
 use demc_infer::evaluate::Difference;
 use demc_model::metrics::{self, METRICS, Metric};
@@ -61,7 +62,7 @@ impl Arguments {
             for sentence in report.sentences(&names) {
                 text += &format!("\n\n{sentence}.");
             }
-            super::print(&text)?;
+            message::result(&text)?;
         }
         let Some(path) = &self.json else {
             return Ok(());
@@ -72,7 +73,7 @@ impl Arguments {
             report: &report,
             differences,
         };
-        super::write_text(path, &serde_json::to_string_pretty(&json)?)
+        super::write_text(path, &message::json(&json)?)
     }
 }
 

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
 use demc_data::ChannelLayout;
+use demc_data::message::{self, printable};
 use demc_data::output::Outputs;
 use demc_infer::bundle::locate;
 use demc_infer::verify::{Runtime, TOLERANCE, verify};
@@ -13,7 +14,7 @@ use demc_infer::{Bundle, BundleFile, Names, Precision};
 
 use super::flags::ModelFlag;
 use super::layouts::LAYOUT;
-use super::{UsageError, check_output, print};
+use super::{UsageError, check_output};
 
 /// Variable with the interpreter for `--verify`.
 const PYTHON_VARIABLE: &str = "DEMC_PYTHON";
@@ -127,18 +128,18 @@ impl Arguments {
             let layout = ChannelLayout::resolve(name);
             bundle.meta.layout = layout.map_err(|error| UsageError(error.to_string()))?;
         }
-        let output = self.output.display();
+        let output = printable(&self.output.display().to_string());
         match self.format {
             Format::Safetensors => {
                 bundle.export(&self.output, names, precision)?;
                 let tensors = bundle.tensors(names).len();
-                print(&format!(
+                message::status(format_args!(
                     "{output}: {tensors} tensors, read back and compared"
-                ))?;
+                ));
             }
             Format::Onnx => {
                 bundle.export_onnx(&self.output, precision)?;
-                print(&format!("{output}: ONNX graph, read back and compared"))?;
+                message::status(format_args!("{output}: ONNX graph, read back and compared"));
             }
         }
         match self.verify {
@@ -158,14 +159,14 @@ impl Arguments {
             Format::Safetensors => Runtime::PyTorch,
         };
         let found = verify(&self.output, runtime, &python, expected)?;
-        print(&format!(
+        message::result(&format!(
             "{}: largest deviation, relative to the batch's largest value and to sqrt(x^2 + 0.001) of each value x",
             found.runtime
         ))?;
         for deviation in &found.deviations {
             let [batch, height, width] = deviation.size;
             let (of_largest, of_value) = (deviation.of_largest, deviation.of_value);
-            print(&format!(
+            message::result(&format!(
                 "{batch} x {height:>3} x {width:>3}  {of_largest:.1e}  {of_value:.1e}"
             ))?;
         }

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use demc_data::exr::MAX_SIDE;
 use demc_data::output::Outputs;
 use demc_infer::bundle::locate;
 use demc_infer::compute::ComputeFlags;
@@ -81,8 +82,9 @@ pub struct EnsembleFlag {
 pub struct TilingFlags {
     /// Context around each tile, rounded up to a multiple of 32. 192 gives the same result as the
     /// whole image. Less is faster and approximate; the error at seams is measured and printed
-    #[arg(long, value_name = "PX", default_value_t = EXACT_HALO)]
-    halo: usize,
+    #[arg(long, value_name = "PX", default_value_t = EXACT_HALO as u32,
+        value_parser = clap::value_parser!(u32).range(0..=MAX_SIDE as i64))]
+    halo: u32,
     /// Longest side of a tile without its halo [default: as memory allows]
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(32..))]
     tile: Option<u32>,
@@ -94,7 +96,7 @@ pub struct TilingFlags {
 impl TilingFlags {
     pub fn tiling(&self) -> Tiling {
         Tiling {
-            halo: self.halo,
+            halo: self.halo as usize,
             side: self.tile.map(|side| side as usize),
             memory: self.memory.map(|mib| mib << 20),
         }

@@ -4,11 +4,12 @@ use std::path::PathBuf;
 
 use burn::tensor::Device;
 use clap::Args;
+use demc_data::message::{self, printable};
 use demc_data::output::Outputs;
 use demc_infer::bundle::locate;
 use demc_infer::{BundleError, BundleFile, Names, Precision};
 
-use super::{check_output, print};
+use super::check_output;
 
 /// Import weights that were trained in PyTorch with the package of python/.
 ///
@@ -57,9 +58,10 @@ impl Arguments {
         let bundle = file.into_bundle(&Device::flex())?;
         bundle.export(&self.output, Names::Burn, Precision::F32)?;
         let tensors = bundle.tensors(Names::Burn).len();
-        let output = self.output.display();
-        print(&format!(
+        let output = printable(&self.output.display().to_string());
+        message::status(format_args!(
             "{output}: {tensors} tensors, read back and compared"
-        ))
+        ));
+        Ok(())
     }
 }

@@ -5,6 +5,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
+use demc_data::message;
+
 use super::UsageError;
 
 /// Range of frame numbers: `7` or `1-240`.
@@ -46,6 +48,8 @@ pub struct Sequence {
     pub files: Vec<PathBuf>,
     /// Up to [`SAMPLES`] of all its frames, evenly spaced: the same for every choice of frames.
     pub samples: Vec<PathBuf>,
+    /// Names the missing frames, if there are any.
+    pub missing: Option<String>,
 }
 
 /// Number of frames from which the exposure of a sequence is measured.
@@ -57,7 +61,7 @@ const MAX_GAPS: usize = 20;
 impl Inputs {
     /// Expands `arguments`.
     ///
-    /// - A file stands for itself, a directory for its `*.exr`.
+    /// - A file stands for itself, a directory for its `*.exr`, links without a target included.
     /// - `shot.####.exr` and `shot.%04d.exr` stand for the frames of a sequence.
     /// - Names with `*`, `?` or `[..]` are glob patterns if no such file exists.
     ///
@@ -104,12 +108,22 @@ impl Inputs {
             sequences,
         })
     }
+
+    /// Reports missing frames of sequences. Returns the number of sequences that have any.
+    pub fn report_missing(&self) -> usize {
+        let missing = self.sequences.iter();
+        let missing = missing.filter_map(|sequence| sequence.missing.as_ref());
+        missing
+            .inspect(|missing| message::say(format_args!("error: {missing}")))
+            .count()
+    }
 }
 
 fn directory(path: &Path) -> Result<Vec<PathBuf>, UsageError> {
     let mut files: Vec<PathBuf> = entries(path)?
         .into_iter()
-        .filter(|file| is_exr(file) && file.is_file())
+        // Reading anything but a file gives the best error.
+        .filter(|file| is_exr(file) && !file.is_dir())
         .collect();
     files.sort();
     Ok(files)
@@ -144,7 +158,7 @@ fn pattern(argument: &Path) -> Result<Vec<PathBuf>, UsageError> {
     let mut files = Vec::new();
     for path in found {
         let path = path.map_err(|source| error(&source))?;
-        if path.is_file() {
+        if !path.is_dir() {
             files.push(path);
         }
     }
@@ -187,10 +201,9 @@ impl<'a> SequencePattern<'a> {
         if let Some(frames) = frames {
             found.retain(|(number, _)| (frames.first..=frames.last).contains(number));
         }
-        if let Some(missing) = missing(&found, frames) {
-            eprintln!("note: {}: {missing}", self.argument.display());
-        }
+        let missing = missing(&found, frames);
         Ok(Sequence {
+            missing: missing.map(|frames| format!("{}: {frames}", self.argument.display())),
             files: found.into_iter().map(|(_, path)| path).collect(),
             samples,
         })
@@ -280,6 +293,7 @@ mod tests {
     #[test]
     fn a_directory_stands_for_its_images_by_name() {
         let dir = directory_of(&["b.exr", "a.EXR", "c.txt"]);
+        fs::create_dir(dir.path().join("d.exr")).expect("a directory");
         assert_eq!(names(&dir, "", None), ["a.EXR", "b.exr"]);
     }
 

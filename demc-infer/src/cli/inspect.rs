@@ -1,18 +1,18 @@
 //! `demc-infer inspect`: shows a model's network, statistics and channel layout.
 
 use std::fmt::Write;
-use std::path::PathBuf;
 
 use burn::tensor::Device;
 use clap::Args;
 use demc_data::ChannelLayout;
 use demc_data::frame::FEATURE_NAMES;
 use demc_data::layout::Missing;
+use demc_data::message::{self, printable};
 use demc_infer::{Bundle, BundleMeta, Names, Precision};
 use serde::Serialize;
 
 use super::flags::ModelFlag;
-use super::{print, utf8_for_json};
+use super::utf8_for_json;
 
 /// Show a model: network, training step, statistics and input channels.
 ///
@@ -34,7 +34,7 @@ pub struct Arguments {
 
 #[derive(Serialize)]
 struct ModelSummary {
-    file: PathBuf,
+    file: String,
     #[serde(flatten)]
     meta: BundleMeta,
     names: Names,
@@ -76,7 +76,7 @@ impl Arguments {
         });
         let parameters = meta.model.parameter_count();
         let summary = ModelSummary {
-            file,
+            file: file.display().to_string(),
             meta,
             names,
             precision,
@@ -84,10 +84,11 @@ impl Arguments {
             albedo_filter,
             tensors,
         };
-        print(&match self.json {
-            true => serde_json::to_string_pretty(&summary)?,
+        let text = match self.json {
+            true => message::json(&summary)?,
             false => summary.text()?,
-        })
+        };
+        Ok(message::result(&text)?)
     }
 }
 
@@ -96,7 +97,7 @@ impl ModelSummary {
         let Self { meta, .. } = self;
         let mut text = String::new();
         let t = &mut text;
-        writeln!(t, "file        {}", self.file.display())?;
+        writeln!(t, "file        {}", printable(&self.file))?;
         writeln!(t, "network     {}", meta.model)?;
         writeln!(t, "parameters  {}", self.parameters)?;
         writeln!(t, "step        {}", meta.step)?;
@@ -149,8 +150,9 @@ impl ModelSummary {
 
 /// The buffers of a layout: name, channels, and the replacement for missing channels.
 fn buffers(layout: &ChannelLayout) -> Vec<(&'static str, String, &'static str)> {
-    let channels =
-        |names: Option<&[String; 3]>| names.map_or("none".into(), |names| names.join(" "));
+    let channels = |names: Option<&[String; 3]>| {
+        names.map_or("none".into(), |names| printable(&names.join(" ")))
+    };
     let mut rows = vec![("color", channels(Some(&layout.color)), "refused")];
     for (buffer, names, missing) in layout.features() {
         let missing = match missing {

@@ -7,7 +7,7 @@ use clap::Args;
 use demc_data::exr::ExrFile;
 use demc_data::layout::{FileLayout, Missing, detect};
 use demc_data::output::Outputs;
-use demc_data::{ChannelLayout, Dataset, Error};
+use demc_data::{ChannelLayout, Dataset, Error, message};
 use demc_infer::Bundle;
 
 use super::UsageError;
@@ -126,7 +126,7 @@ impl Layouts<'_> {
 
 /// Prints a choice on stderr.
 pub fn say(choice: &str) {
-    eprintln!("note: {choice}");
+    message::say(format_args!("note: {choice}"));
 }
 
 fn describe(found: &FileLayout) -> String {

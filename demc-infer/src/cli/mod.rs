@@ -23,6 +23,7 @@ mod warnings;
 use std::path::Path;
 
 use clap::{Parser, Subcommand};
+use demc_data::message;
 use demc_data::output::{Directories, OutputError, Outputs};
 
 /// Use a trained DEMC network: denoise and score renderings, export and import weights.
@@ -85,7 +86,9 @@ impl Clamped {
     fn report(self) {
         let Self { samples, images } = self;
         if samples > 0 {
-            eprintln!("note: {samples} negative radiance sample(s) in {images} image(s) set to 0");
+            message::say(format_args!(
+                "note: {samples} negative radiance sample(s) in {images} image(s) set to 0"
+            ));
         }
     }
 }
@@ -110,19 +113,10 @@ fn utf8_for_json(path: &Path) -> Result<(), UsageError> {
 /// Writes `text` and a newline to stdout if `path` is `-`, otherwise to a file.
 fn write_text(path: &Path, text: &str) -> anyhow::Result<()> {
     if path == Path::new("-") {
-        return print(text);
+        return Ok(message::result(text)?);
     }
     demc_data::file::write_whole(path, |file| {
         std::io::Write::write_all(file, format!("{text}\n").as_bytes())
     })?;
     Ok(())
-}
-
-/// Prints a line to stdout. A closed pipe (`| head`) is no failure.
-fn print(text: &str) -> anyhow::Result<()> {
-    use std::io::{ErrorKind, Write};
-    match writeln!(std::io::stdout(), "{text}") {
-        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(error.into()),
-        _ => Ok(()),
-    }
 }

@@ -2,6 +2,7 @@
 
 use std::fmt::Display;
 
+use demc_data::message;
 use indicatif::{ProgressBar, ProgressStyle};
 
 pub struct Progress(ProgressBar);
@@ -14,7 +15,7 @@ impl Progress {
     }
 
     pub fn start(&self, name: impl Display) {
-        self.0.set_message(name.to_string());
+        self.0.set_message(message::printable(&name.to_string()));
     }
 
     pub fn advance(&self) {
@@ -23,7 +24,7 @@ impl Progress {
 
     /// Prints a line on stderr that the bar does not overwrite.
     pub fn line(&self, line: impl Display) {
-        self.0.suspend(|| eprintln!("{line}"));
+        self.0.suspend(|| message::say(line));
     }
 
     pub fn finish(self) {

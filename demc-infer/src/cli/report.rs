@@ -4,6 +4,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use clap::Args;
+use demc_data::message::{self, printable};
 use demc_infer::report::{About, ReportPage};
 
 use super::scenes::Scenes;
@@ -41,11 +42,13 @@ impl Arguments {
         };
         let html = page.html(&about, &report)?;
         demc_data::file::write_whole(&self.output, |file| file.write_all(html.as_bytes()))?;
-        super::print(&format!(
+        let summary = format!(
             "{}: {} images, {:.1} MB",
             self.output.display(),
             report.images.len(),
             html.len() as f64 / 1e6
-        ))
+        );
+        message::status(printable(&summary));
+        Ok(())
     }
 }

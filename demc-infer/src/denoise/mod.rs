@@ -58,7 +58,7 @@ pub struct Denoised {
 }
 
 impl Bundle {
-    /// Denoises `frame`, which can have any size.
+    /// Denoises `frame`, of any size that a file can have ([`demc_data::exr::check_size`]).
     ///
     /// The image is processed whole if memory allows, otherwise in tiles with the same result
     /// ([`crate::tiles`]). It is padded by edge replication to multiples of 32 and cropped
@@ -102,7 +102,7 @@ impl Bundle {
         self.check_statistics(frame)?;
         input.filter_albedo(tiling)?;
         let tiles = self
-            .tiles(frame.height, frame.width, tiling, ensemble)
+            .tiles_beside(outputs(frame), frame.height, frame.width, tiling, ensemble)
             .map_err(|source| DenoiseError::Memory {
                 name: frame.name.clone(),
                 source,
@@ -174,10 +174,22 @@ impl Bundle {
         tiling: &Tiling,
         ensemble: Ensemble,
     ) -> Result<Tiles, memory::TooLarge> {
+        self.tiles_beside(COLOR_CHANNELS, height, width, tiling, ensemble)
+    }
+
+    /// As [`tiles`](Self::tiles), for an image with this number of output planes.
+    fn tiles_beside(
+        &self,
+        outputs: usize,
+        height: usize,
+        width: usize,
+        tiling: &Tiling,
+        ensemble: Ensemble,
+    ) -> Result<Tiles, memory::TooLarge> {
         let padding = Padding { height, width };
         let padded = (padding.padded_height(), padding.padded_width());
         let budget = tiling.memory.or_else(|| {
-            let output = (COLOR_CHANNELS * height * width * size_of::<f32>()) as u64;
+            let output = (outputs * height * width * size_of::<f32>()) as u64;
             Some(self.memory_budget()?.saturating_sub(output))
         });
         let modulation = match self.meta.normalizer.albedo_demodulation_epsilon {
@@ -222,5 +234,14 @@ impl Bundle {
     pub(crate) fn device(&self) -> Device {
         let devices = self.model.devices();
         devices.first().expect("every network has weights").clone()
+    }
+}
+
+/// Number of planes that are in memory beside a pass: the denoised colour and the filtered albedo; with
+/// alpha, also alpha as grey, its denoised image, the result, and the mask of its edges.
+fn outputs(frame: &Frame) -> usize {
+    match frame.alpha {
+        Some(_) => 4 * COLOR_CHANNELS + 2,
+        None => 2 * COLOR_CHANNELS,
     }
 }

@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use demc_data::message::printable;
 use demc_model::metrics::{METRICS, Metric};
 
 use super::{Report, Score, is_headline};
@@ -75,7 +76,7 @@ fn row(
 }
 
 fn escaped(name: &str) -> String {
-    name.replace('|', "\\|")
+    printable(name).replace('|', "\\|")
 }
 
 /// Aligned rows with a rule under the first. The first column is left-aligned, the others

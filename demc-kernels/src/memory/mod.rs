@@ -126,6 +126,12 @@ impl FreeList {
         None
     }
 
+    /// Removes some block to return to the system.
+    fn any(&mut self) -> Option<FreeBlock> {
+        let last = self.count.checked_sub(1)?;
+        Some(self.remove(last))
+    }
+
     /// Removes a block to return to the system: the smallest one, as long as more is held than the
     /// peak use. This returns the memory of finished phases of a run, smallest pieces first.
     fn surplus(&mut self) -> Option<FreeBlock> {
@@ -148,13 +154,28 @@ fn block_size(size: usize, align: usize) -> Option<usize> {
 
 /// An initialised block, and whether it is zeroed; null if there is no memory.
 fn block(size: usize) -> (*mut u8, bool) {
-    if let Some(address) = kept().take(size) {
-        return (std::ptr::with_exposed_provenance_mut(address), false);
-    }
+    let peak = {
+        let mut kept = kept();
+        let peak = kept.most_used;
+        if let Some(address) = kept.take(size) {
+            return (std::ptr::with_exposed_provenance_mut(address), false);
+        }
+        peak
+    };
     // Before the process grows, blocks that are too small for this request are returned.
     give_back(None);
     let mapped = size.next_multiple_of(LARGE);
-    let pointer = system::map(mapped);
+    let mut pointer = system::map(mapped);
+    if pointer.is_null() {
+        // A limit may leave no room beside the free blocks.
+        std::iter::from_fn(|| kept().any()).for_each(|block| give_back(Some(block)));
+        pointer = system::map(mapped);
+    }
+    if pointer.is_null() {
+        let mut kept = kept();
+        kept.used -= size;
+        kept.most_used = peak.max(kept.used);
+    }
     if mapped > size && !pointer.is_null() {
         let rest = FreeBlock {
             address: pointer.expose_provenance() + size,

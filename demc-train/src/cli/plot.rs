@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Args;
+use demc_data::message::printable;
 use demc_data::output::{Directories, Outputs};
 use demc_infer::bundle::locate;
 use demc_train::record::progress::say;
@@ -50,8 +51,8 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     outputs.prepare(Directories::Expect)?;
     let drawn = plot(&runs, &stem, &PlotOptions { smooth, linear })?;
     for note in drawn.notes {
-        say(format!("note: {note}"));
+        say(format!("note: {}", printable(&note)));
     }
-    say(drawn.path.display());
+    say(printable(&drawn.path.display().to_string()));
     Ok(ExitCode::SUCCESS)
 }

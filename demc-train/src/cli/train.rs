@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
+use demc_data::message::printable;
 use demc_train::config::{Config, ConfigError, utf8};
 use demc_train::record::progress::say;
 use demc_train::run::run_dir::{CONFIG, copy_in_checkpoint};
@@ -39,6 +40,11 @@ pub struct Arguments {
     /// Check configuration and data and print the estimated duration; writes nothing
     #[arg(long)]
     check: bool,
+}
+
+/// A path in one line.
+fn shown(path: &Path) -> String {
+    printable(&path.display().to_string())
 }
 
 /// The edit that sets the run directory.
@@ -79,12 +85,12 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     session.check_outputs(&[file])?;
     say(format!("demc-train: {}", session.headline()));
     say(format!("\n{}", session.run().config().to_toml()));
-    say(format!("data: {} in {}", session.data, root.display()));
+    say(format!("data: {} in {}", session.data, shown(&root)));
     for warning in &session.warnings {
-        say(format!("warning: {warning}"));
+        say(format!("warning: {}", printable(warning)));
     }
     for note in &session.notes {
-        say(format!("note: {note}"));
+        say(format!("note: {}", printable(note)));
     }
     let run = session.run();
     say(format!(
@@ -105,7 +111,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         });
         return Ok(ExitCode::SUCCESS);
     }
-    say(format!("run: {}\n", dir.display()));
+    say(format!("run: {}\n", shown(&dir)));
     match session.finish()? {
         SessionOutcome::Stopped { signal, step } => {
             return Ok(stopped(signal, step, "--resume resumes the run"));
@@ -120,6 +126,6 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
             }
         }
     }
-    say(format!("\nweights, pictures and scores: {}", dir.display()));
+    say(format!("\nweights, pictures and scores: {}", shown(&dir)));
     Ok(ExitCode::SUCCESS)
 }

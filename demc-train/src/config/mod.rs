@@ -19,6 +19,7 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use demc_data::DataConfig;
+use demc_data::message::printable;
 use demc_model::kernel_head::GAMMA;
 use demc_model::{Head, LossConfig, ModelConfig, Variant};
 use serde::{Deserialize, Serialize};
@@ -104,8 +105,7 @@ impl Config {
     pub fn parse(path: &Path, text: &str, sets: &[String]) -> Result<Self, ConfigError> {
         let config = source::parse::<Config>(path, text, sets, &Self::keys());
         // Keys may contain line breaks and terminal control codes.
-        let printable = |error: String| error.replace(char::is_control, "\u{fffd}");
-        let mut config = config.map_err(|error| ConfigError::Source(printable(error)))?;
+        let mut config = config.map_err(|error| ConfigError::Source(printable(&error)))?;
         let problems = config.validate();
         let (from_sets, problems) = source::blame(problems, sets);
         if !from_sets.is_empty() {
@@ -113,7 +113,7 @@ impl Config {
             if !problems.is_empty() {
                 all.push(format!("{}: {}", path.display(), problems.join("; ")));
             }
-            return Err(ConfigError::Source(printable(all.join("; "))));
+            return Err(ConfigError::Source(printable(&all.join("; "))));
         }
         if !problems.is_empty() {
             return Err(ConfigError::Values {

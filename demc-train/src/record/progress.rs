@@ -1,9 +1,9 @@
 //! The progress bar on stderr, and lines on stdout that the bar does not overwrite.
 
 use std::fmt::Display;
-use std::io::{Write, stdout};
 use std::time::Instant;
 
+use demc_data::message;
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// A progress bar over the steps of a run. It is hidden if stderr is not a terminal.
@@ -59,5 +59,5 @@ impl StepProgress {
 
 /// Prints a line on stdout. A closed pipe (`| head`) does not stop the training.
 pub fn say(line: impl Display) {
-    let _ = writeln!(stdout(), "{line}");
+    message::status(line);
 }

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use demc_data::message::printable;
 use demc_infer::picture::Picture;
 
 use crate::config::Config;
@@ -94,7 +95,7 @@ impl Recorder {
 
     /// Prints a line on the terminal alone.
     pub fn say(&self, text: &str) {
-        self.progress.line(text);
+        self.progress.line(printable(text));
     }
 
     /// Removes the progress bar.

@@ -4,6 +4,7 @@ pub mod checkpoint;
 pub mod data;
 pub mod initial;
 pub mod inputs;
+pub mod memory;
 pub mod run_dir;
 pub mod run_record;
 pub mod session;

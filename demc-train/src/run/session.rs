@@ -12,9 +12,9 @@ use crate::config::Config;
 use crate::run::checkpoint::store::{CheckpointSearch, CheckpointStore};
 use crate::run::checkpoint::{self, Checkpoint};
 use crate::run::data::RunData;
-use crate::run::inputs;
 use crate::run::run_dir::{self, RunDir};
 use crate::run::training::{LoopEnd, TrainingRun};
+use crate::run::{inputs, memory};
 use crate::tools::estimate::DurationEstimate;
 
 /// A run that can start, and what the user should know about it.
@@ -83,6 +83,7 @@ impl Session {
             false => None,
         };
         let data = RunData::open(&config)?;
+        memory::check(&config, device)?;
         if resume {
             dir.check_scenes(&data)?;
         }
