@@ -111,7 +111,11 @@ impl PeakEstimate<'_> {
     }
 
     fn images(&self) -> usize {
-        self.grid.pixels() * (COLOR_CHANNELS + FEATURE_CHANNELS)
+        let features = match self.config.variant.spec().takes_features() {
+            true => FEATURE_CHANNELS,
+            false => 0,
+        };
+        self.grid.pixels() * (COLOR_CHANNELS + features)
     }
 
     fn has_fusion(&self) -> bool {

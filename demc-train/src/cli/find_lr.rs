@@ -86,8 +86,8 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     for extension in ["csv", "svg"] {
         outputs.claim(&with_extension(&stem, extension)?, true)?;
     }
-    outputs.prepare(Directories::Create)?;
     let device = arguments.compute.device()?;
+    outputs.prepare(Directories::Create)?;
     let data = RunData::open(&config)?;
     for warning in &data.warnings {
         say(format!("warning: {warning}"));
