@@ -346,10 +346,8 @@ fn a_small_file_takes_little_memory_whatever_it_promises() {
             Ours::Dwab => Method::DWAB(None),
         };
         for tiles in [false, true] {
-            refused(
-                &bomb(largest, method, tiles),
-                "bomb.exr: not a readable OpenEXR file: ",
-            );
+            // Damaged, or, where so few bytes can hold the pixels, too large for the limit.
+            refused(&bomb(largest, method, tiles), "bomb.exr: ");
         }
     }
     refused(&bomb(largest, Method::ZIP16, false), "cannot hold");
