@@ -257,7 +257,10 @@ impl PeakEstimate<'_> {
             + self.encoder_count() * self.largest_weights(0)
             + 3 * self.rows(0, self.plan.band + 2 * WAITING_ROWS);
         let last = match (is_large, self.config.head) {
-            (true, Head::Kernel) => self.below(0) + self.filter(0).max(bands),
+            (true, Head::Kernel) => {
+                let filtered = self.grid.pixels() * (COLOR_CHANNELS + 1);
+                (self.below(0) + self.filter(0)).max(bands + filtered)
+            }
             (false, Head::Kernel) => self.map(0) + self.filter(0),
             (true, _) => output + bands,
             // The head's products: 9 values per output, in whole vectors.
