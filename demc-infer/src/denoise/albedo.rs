@@ -9,6 +9,7 @@ use std::sync::Arc;
 use demc_data::frame::TEXTURES;
 use demc_data::transform::MAX_ALBEDO;
 use demc_model::config::COLOR_CHANNELS;
+use rayon::prelude::*;
 
 use super::{DenoiseError, FrameInput};
 use crate::ensemble::Ensemble;
@@ -48,15 +49,20 @@ impl FrameInput<'_> {
         let mut filtered = own.denoise_into(self.padded(), &tiles, |_, _| ())?;
         let noisy = self.padding.pad(&color);
         let pixels = filtered.len() / COLOR_CHANNELS;
-        for (i, value) in filtered.iter_mut().enumerate() {
-            let mut channels =
-                (0..COLOR_CHANNELS).map(|channel| noisy[channel * pixels + i % pixels]);
-            // Without a surface there is nothing to filter; neighbours would bleed in.
-            *value = match channels.any(|albedo| albedo > 0.0) {
-                true => value.min(MAX_ALBEDO),
-                false => 0.0,
-            };
-        }
+        let (red, rest) = noisy.split_at(pixels);
+        let (green, blue) = rest.split_at(pixels);
+        filtered.par_chunks_mut(pixels).for_each(|plane| {
+            let albedo = red.iter().zip(green).zip(blue);
+            for (value, ((red, green), blue)) in plane.iter_mut().zip(albedo) {
+                // Without a surface there is nothing to filter; neighbours would bleed in.
+                let has_surface = *red > 0.0 || *green > 0.0 || *blue > 0.0;
+                *value = if has_surface {
+                    value.min(MAX_ALBEDO)
+                } else {
+                    0.0
+                };
+            }
+        });
         self.albedo = Some(Arc::from(filtered));
         Ok(())
     }
