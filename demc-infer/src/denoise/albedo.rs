@@ -34,7 +34,7 @@ impl FrameInput<'_> {
             return Ok(());
         }
         let clamp = |value: &f32| value.clamp(0.0, MAX_ALBEDO);
-        let color: Vec<f32> = albedo.iter().map(clamp).collect();
+        let color: Vec<f32> = albedo.par_iter().map(clamp).collect();
         let own = FrameInput {
             color: &color,
             // The filter takes the positions of the network ([`BundleMeta::filter_problem`]).
@@ -47,19 +47,17 @@ impl FrameInput<'_> {
             source,
         })?;
         let mut filtered = own.denoise_into(self.padded(), &tiles, |_, _| ())?;
-        let noisy = self.padding.pad(&color);
-        let pixels = filtered.len() / COLOR_CHANNELS;
-        let (red, rest) = noisy.split_at(pixels);
-        let (green, blue) = rest.split_at(pixels);
-        filtered.par_chunks_mut(pixels).for_each(|plane| {
-            let albedo = red.iter().zip(green).zip(blue);
-            for (value, ((red, green), blue)) in plane.iter_mut().zip(albedo) {
+        let padded = self.padded();
+        let rows = filtered.par_chunks_mut(padded.width).enumerate();
+        rows.for_each(|(row, filtered)| {
+            let first = (row % padded.height).min(frame.height - 1) * frame.width;
+            for (column, value) in filtered.iter_mut().enumerate() {
+                let pixel = first + column.min(frame.width - 1);
+                let mut albedo = color[pixel..].iter().step_by(pixels);
                 // Without a surface there is nothing to filter; neighbours would bleed in.
-                let has_surface = *red > 0.0 || *green > 0.0 || *blue > 0.0;
-                *value = if has_surface {
-                    value.min(MAX_ALBEDO)
-                } else {
-                    0.0
+                *value = match albedo.any(|channel| *channel > 0.0) {
+                    true => value.min(MAX_ALBEDO),
+                    false => 0.0,
                 };
             }
         });
