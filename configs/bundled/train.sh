@@ -56,17 +56,11 @@ render() {
     touch "data/bundled/$name/complete"
 }
 
-# Renders views of stock renderers: stock RENDERER SCENES
+# Renders views of stock renderers: stock NAME RENDERER SCENES OPTION...
 stock() {
-    [ -e data/bundled/clean-d/complete ] && return
-    "$python" tests/renderers/data_set.py "$1" "$2" -o data/bundled/d --with "$base" \
-        --copies 4 --size 192x192 --ref-spp 96
-}
-
-# Renders views of stock renderers for the albedo filter: albedo RENDERER SCENES
-albedo() {
-    [ -e data/bundled/albedo/manifest.json ] && return
-    "$python" tests/renderers/data_set.py "$1" "$2" -o data/bundled/e --size 224x224 --ref-spp 64
+    name=$1 renderer=$2 scenes=$3
+    shift 3
+    "$python" tests/renderers/data_set.py "$renderer" "$scenes" -o "data/bundled/$name" "$@"
 }
 
 # Denoises the references of a data set: clean NAME RENDERED
@@ -106,18 +100,21 @@ render_all() {
     clean clean-c c1
 
     # Stage 13: the base set and 30 views of stock renderers, each listed four times.
-    stock cycles 101-117
-    stock mitsuba 202-208
-    stock luxcore 302-307
-    clean clean-d d
+    if [ ! -e data/bundled/clean-d/complete ]; then
+        set -- --with "$base" --copies 4 --size 192x192 --ref-spp 96
+        stock d cycles 101-117 "$@"
+        stock d mitsuba 202-208 "$@"
+        stock d luxcore 302-307 "$@"
+        clean clean-d d
+    fi
 
-    # Albedo filter: those 30 views, 54 others, and 90 rooms and still lifes.
-    albedo cycles 118-139
-    albedo mitsuba 209-224
-    albedo luxcore 308-323
+    # Albedo filter: those 30 views, 55 others, and 86 rooms and still lifes.
+    [ ! -e data/bundled/albedo/manifest.json ] || return 0
+    stock e cycles 118-140 --size 224x224 --ref-spp 64
+    stock e mitsuba 209-224 --size 224x224 --ref-spp 64
+    stock e luxcore 308-323 --size 224x224 --ref-spp 64
     render e1 data/bundled/e --rooms 26 --stills 26 --size 192 --grain 0.8 --sun 0.8 --ref-spp 64 --residual 1 --seed 71
-    [ -e data/bundled/albedo/manifest.json ] ||
-        "$python" configs/bundled/albedo_set.py data/bundled/d data/bundled/e data/bundled/e1 -o data/bundled/albedo
+    "$python" configs/bundled/albedo_set.py data/bundled/d data/bundled/e data/bundled/e1 -o data/bundled/albedo
 }
 
 # A trial runs in a directory in which every data set is data/sample.

@@ -31,6 +31,27 @@ pub struct Batch {
     pub patches: Vec<Patch>,
 }
 
+impl Batch {
+    /// `size` flat patches of `side` x `side` pixels, for measurements of time and memory.
+    pub fn grey(size: usize, side: usize) -> Self {
+        let planes = |channels: usize| vec![0.5; size * channels * side * side];
+        let patch = Patch {
+            scene: 0,
+            y: 0,
+            x: 0,
+        };
+        Self {
+            size,
+            patch_size: side,
+            color_gamma: planes(3),
+            features_z: planes(FEATURES),
+            modulation: None,
+            reference_hdr: planes(3),
+            patches: vec![patch; size],
+        }
+    }
+}
+
 /// Computes any batch of a training run, on any thread.
 pub struct PatchSource {
     cache: SceneCache,

@@ -6,12 +6,11 @@ use std::collections::BTreeMap;
 use crate::ChannelLayout;
 use crate::frame::FramePlanes;
 use crate::layout::Missing;
+use crate::message::short_list;
 use crate::plane::Plane;
 
 /// Largest plausible reference, linear HDR. Squares overflow from 1.8e19 on (Eq. 5).
 const MAX_REFERENCE: f32 = 1e15;
-/// Number of scenes that a warning names.
-const SCENES_NAMED: usize = 5;
 
 /// What an image lacks or exceeds, one phrase each; empty for a usable image.
 pub fn suspicious(planes: &FramePlanes, layout: &ChannelLayout) -> Vec<String> {
@@ -49,17 +48,8 @@ pub fn by_problem(found: &[(String, Vec<String>)]) -> Vec<String> {
     }
     let lines = scenes.into_iter();
     lines
-        .map(|(problem, scenes)| format!("{problem}: {}", listed(&scenes)))
+        .map(|(problem, scenes)| format!("{problem}: {}", short_list(&scenes)))
         .collect()
-}
-
-/// The first names, and how many follow.
-pub fn listed(names: &[&str]) -> String {
-    let shown = &names[..names.len().min(SCENES_NAMED)];
-    match names.len() - shown.len() {
-        0 => shown.join(", "),
-        more => format!("{} and {more} more", shown.join(", ")),
-    }
 }
 
 #[cfg(test)]

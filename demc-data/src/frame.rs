@@ -2,15 +2,19 @@
 //! is NaN or infinite, and no radiance is negative. [`FramePlanes`] keeps the file's precision;
 //! [`Frame`] is `f32`.
 
+mod channels;
+
 use std::io::{Read, Seek};
 use std::path::Path;
 
 use crate::Error;
 use crate::channel::Window;
 use crate::exr::ExrFile;
-use crate::layout::{ChannelLayout, Missing, Triple};
+use crate::layout::ChannelLayout;
 use crate::parallel;
 use crate::plane::{Plane, clear_infinite};
+
+use channels::FrameChannels;
 
 /// Number of feature channels: normal xyz, position xyz, texture RGB at the first and at the second
 /// vertex (Sec. 3.1).
@@ -319,112 +323,6 @@ pub fn check_open_header<R: Read + Seek>(
 ) -> Result<Window, Error> {
     let layout = &*layout.in_file(file, None)?;
     FrameChannels::new(file, layout, reference, Presence::IfPresent)?.window(file.path(), file)
-}
-
-/// The channels of a frame; `None` stands for zeros.
-struct FrameChannels<'a> {
-    color: Vec<Option<&'a str>>,
-    features: Vec<Option<&'a str>>,
-    reference: Option<Vec<Option<&'a str>>>,
-    mask: Vec<Option<&'a str>>,
-    alpha: Vec<Option<&'a str>>,
-}
-
-impl<'a> FrameChannels<'a> {
-    fn new<R: Read + Seek>(
-        file: &ExrFile<R>,
-        layout: &'a ChannelLayout,
-        reference: Presence,
-        mask: Presence,
-    ) -> Result<Self, Error> {
-        let is_present = |names: &[String]| names.iter().any(|name| file.channel(name).is_some());
-        let read = |presence: Presence, names: &[String]| match presence {
-            Presence::Skip => false,
-            Presence::IfPresent => is_present(names),
-            Presence::Required => true,
-        };
-        let mut features: Vec<Option<&str>> = Vec::with_capacity(FEATURES);
-        for (buffer, names, missing) in layout.features() {
-            match (names, missing) {
-                // If one of the three channels is present, the buffer counts as present, and the
-                // other channels are missing.
-                (Some(names), policy) if policy == Missing::Error || is_present(names) => {
-                    features.extend(slots(names))
-                }
-                (None, Missing::Error) => {
-                    let detail = format!("{buffer} names no channels and has no policy");
-                    return Err(Error::Layout {
-                        name: "in use".to_owned(),
-                        detail,
-                    });
-                }
-                (_, Missing::CopyTexture1) => features.extend_from_within(6..9),
-                _ => features.extend([None; 3]),
-            }
-        }
-        let reference = layout
-            .reference
-            .as_ref()
-            .filter(|names| read(reference, &names[..]));
-        let single = |name: &'a Option<String>, presence| {
-            let names = name.iter();
-            let names = names.filter(move |name| read(presence, std::slice::from_ref(name)));
-            names.map(|name| Some(name.as_str())).collect()
-        };
-        // Files of renderers differ in whether they have an alpha channel.
-        let alpha = match mask {
-            Presence::Skip => Presence::Skip,
-            _ => Presence::IfPresent,
-        };
-        let wanted = Self {
-            color: slots(&layout.color),
-            features,
-            reference: reference.map(slots),
-            mask: single(&layout.mask, mask),
-            alpha: single(&layout.alpha, alpha),
-        };
-        file.require(&wanted.names())?;
-        Ok(wanted)
-    }
-
-    /// The channels to decode, in the order of the fields; a copied texture appears twice.
-    fn names(&self) -> Vec<&'a str> {
-        let radiance_and_features = self.color.iter().chain(&self.features);
-        radiance_and_features
-            .chain(self.reference.iter().flatten())
-            .chain(&self.mask)
-            .chain(&self.alpha)
-            .copied()
-            .flatten()
-            .collect()
-    }
-
-    /// Index of the first position channel in [`names`](Self::names).
-    fn first_position(&self) -> Option<usize> {
-        let position = self.features.get(POSITIONS..TEXTURES)?;
-        let before = self.color.iter().chain(&self.features[..POSITIONS]);
-        position[0].map(|_| before.flatten().count())
-    }
-
-    fn window<R: Read + Seek>(&self, path: &Path, file: &ExrFile<R>) -> Result<Window, Error> {
-        let names = self.names();
-        let mut channels = names.iter().filter_map(|name| file.channel(name));
-        let first = channels.next().expect("colour is always in the plan");
-        match channels.find(|channel| channel.window != first.window) {
-            None => Ok(first.window),
-            Some(other) => Err(Error::Sizes {
-                path: path.to_owned(),
-                a: first.name.clone(),
-                a_window: first.window.to_string(),
-                b: other.name.clone(),
-                b_window: other.window.to_string(),
-            }),
-        }
-    }
-}
-
-fn slots(names: &Triple) -> Vec<Option<&str>> {
-    names.iter().map(|name| Some(name.as_str())).collect()
 }
 
 /// The samples of all planes. The error is the size of the memory that is missing, in MiB.

@@ -14,6 +14,14 @@ const LONGEST: usize = 4000;
 /// Maximum number of names in a list.
 const MOST_NAMES: usize = 20;
 
+/// The same in a short list.
+const FEW_NAMES: usize = 5;
+
+/// A command line that cannot be carried out: exit code 2. The message names the wrong arguments.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct UsageError(pub String);
+
 /// Whether a terminal would obey the character instead of showing it: control characters, line
 /// separators, and marks that change the direction of text.
 fn is_hidden(c: char) -> bool {
@@ -30,8 +38,12 @@ pub fn printable(text: &str) -> String {
 
 /// As [`printable`], for text of several lines: line breaks stay.
 fn printable_lines(text: &str) -> String {
-    let hidden = |c| is_hidden(c) && c != '\n';
-    escaped(text, hidden, |c| c.escape_default().collect())
+    escaped(text, is_hidden_in_lines, |c| c.escape_default().collect())
+}
+
+/// As [`is_hidden`], for text of several lines.
+fn is_hidden_in_lines(c: char) -> bool {
+    is_hidden(c) && c != '\n'
 }
 
 fn escaped(text: &str, hidden: impl Fn(char) -> bool, escape: impl Fn(char) -> String) -> String {
@@ -45,10 +57,20 @@ fn escaped(text: &str, hidden: impl Fn(char) -> bool, escape: impl Fn(char) -> S
     safe
 }
 
-/// The first names, and the number of the others: `a, b and 7 more`.
-pub fn list(names: &[String]) -> String {
-    let shown = names[..names.len().min(MOST_NAMES)].join(", ");
-    match names.len().saturating_sub(MOST_NAMES) {
+/// The first 20 names, and the number of the others: `a, b and 7 more`.
+pub fn list<S: AsRef<str>>(names: &[S]) -> String {
+    first_names(names, MOST_NAMES)
+}
+
+/// As [`list`], with 5 names.
+pub fn short_list<S: AsRef<str>>(names: &[S]) -> String {
+    first_names(names, FEW_NAMES)
+}
+
+fn first_names<S: AsRef<str>>(names: &[S], most: usize) -> String {
+    let shown: Vec<&str> = names.iter().take(most).map(AsRef::as_ref).collect();
+    let shown = shown.join(", ");
+    match names.len().saturating_sub(most) {
         0 => shown,
         more => format!("{shown} and {more} more"),
     }
@@ -62,7 +84,7 @@ pub fn json(value: &impl Serialize) -> serde_json::Result<String> {
     let text = serde_json::to_string_pretty(value)?;
     // They occur only within strings, and have at most 16 bits.
     let escape = |c| format!("\\u{:04x}", u32::from(c));
-    Ok(escaped(&text, |c| is_hidden(c) && c != '\n', escape))
+    Ok(escaped(&text, is_hidden_in_lines, escape))
 }
 
 /// Prints a message as one line on standard error. Very long messages are cut. A closed or full
@@ -119,7 +141,7 @@ mod tests {
         assert_eq!(printable_lines("a\nb\tc"), "a\nb\\tc");
         assert_eq!(printable("größe 日本"), "größe 日本");
         let text = json(&[hostile]).expect("JSON");
-        assert!(!text.contains(|c| is_hidden(c) && c != '\n'), "{text:?}");
+        assert!(!text.contains(is_hidden_in_lines), "{text:?}");
         let back: Vec<String> = serde_json::from_str(&text).expect("still JSON");
         assert_eq!(back, [hostile]);
     }
@@ -128,6 +150,7 @@ mod tests {
     fn a_long_list_is_counted() {
         let names = |count: usize| (0..count).map(|i| i.to_string()).collect::<Vec<_>>();
         assert_eq!(list(&names(3)), "0, 1, 2");
+        assert_eq!(short_list(&names(6)), "0, 1, 2, 3, 4 and 1 more");
         assert!(list(&names(100)).ends_with("18, 19 and 80 more"));
     }
 }

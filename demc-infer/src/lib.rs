@@ -42,8 +42,8 @@
 //!
 //! - [`bundle`]: a [`Bundle`] is a network with its configuration, normalisation statistics,
 //!   channel layout and training step. This module alone reads and writes its file.
-//! - [`denoise`]: denoises a frame of the size of any file, with [`padding`], [`tiles`] that fit into the
-//!   available [`memory`], and optional test-time augmentation ([`ensemble`](mod@ensemble)).
+//! - [`denoise`]: denoises a frame of the size of any file, with [`padding`], [`tiles`] that fit into
+//!   the available [`memory`], and optional test-time augmentation ([`ensemble`](mod@ensemble)).
 //! - [`guard`]: compares an image with the training data, then refuses it or warns.
 //! - [`onnx`]: exports the network for other runtimes. [`verify`](mod@verify) compares their output
 //!   with this crate's.

@@ -1,8 +1,9 @@
 //! Available memory, measured before an image is denoised.
 //!
 //! On Linux, it is the least that the machine, each control group of this process (containers,
-//! batch systems), and the process's own limits (`ulimit -v`, `ulimit -d`) leave. Memory that this process keeps for its next
-//! image counts as available. On other systems it is unknown, and no image is refused.
+//! batch systems), and the process's own limits (`ulimit -v`, `ulimit -d`) leave. Memory that this
+//! process keeps for its next image counts as available. On other systems it is unknown, and no
+//! image is refused.
 
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -1,7 +1,7 @@
 //! The blend of a filtered image with a coarser one (Vogels et al. 2018).
 //!
-//! `o = y + b U(c - D(y))`: `y` is the filtered image of a level, `b` its blend weight, `c` the
-//! output of the level below, D the 2x2 mean, U the bilinear doubling with half-pixel centres. So
+//! `o = y + b U(c - D(y))`. `y` is the filtered image of a level, `b` its blend weight, and `c` the
+//! output of the level below. D is the 2x2 mean, U the bilinear doubling with half-pixel centres. So
 //! `b` = 1 replaces the low frequencies of `y` by those of `c`.
 //!
 //! No operation is fused, so the bits are the same on every path.

@@ -1,5 +1,5 @@
-//! Powers of float32 values, computed in float64. The bits are the same on every path and platform,
-//! and the compiler vectorises the loops.
+//! Powers of float32 values, computed in float64, and exponentials. The bits are the same on every
+//! path and platform, and the compiler vectorises the loops.
 
 use std::f64::consts::{LN_2, LOG2_E, SQRT_2};
 
@@ -96,6 +96,39 @@ pub(crate) fn power(x: f64, exponent: f64) -> f64 {
     }
 }
 
+/// `e^x` to 2e-7 for x up to 0; 0 below -87. NaN stays NaN.
+#[inline(always)]
+pub(crate) fn exp(x: f32) -> f32 {
+    /// Added to an integer below 2^22, this leaves its bits at the low end of the mantissa.
+    const SHIFT: f32 = 1.5 * (1u32 << 23) as f32;
+    const LOG2_E: f32 = std::f32::consts::LOG2_E;
+    // Two parts of ln(2); the first has few bits, so that its product with an integer is exact.
+    const LN2_HIGH: f32 = 0.693_359_4;
+    const LN2_LOW: f32 = -2.121_944_4e-4;
+    let clamped = if x < -87.0 { -87.0 } else { x };
+    let whole = clamped * LOG2_E + SHIFT;
+    let n = whole - SHIFT;
+    let z = (clamped - n * LN2_HIGH) - n * LN2_LOW;
+    // exp(z) = 1 + z/1 (1 + z/2 (1 + z/3 (...))), |z| below 0.35.
+    let mut series = 1.0 + z * (1.0 / 7.0);
+    series = 1.0 + z * (1.0 / 6.0) * series;
+    series = 1.0 + z * (1.0 / 5.0) * series;
+    series = 1.0 + z * (1.0 / 4.0) * series;
+    series = 1.0 + z * (1.0 / 3.0) * series;
+    series = 1.0 + z * (1.0 / 2.0) * series;
+    series = 1.0 + z * series;
+    let scale = f32::from_bits((whole.to_bits() << 23).wrapping_add(1.0f32.to_bits()));
+    if x < -87.0 { 0.0 } else { series * scale }
+}
+
+/// `1 / (1 + e^-x)`.
+#[inline(always)]
+pub(crate) fn sigmoid(x: f32) -> f32 {
+    let small = exp(-x.abs());
+    let positive = 1.0 / (1.0 + small);
+    if x < 0.0 { small * positive } else { positive }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -141,5 +174,22 @@ mod tests {
                 same_on_any_number_of_threads(|| bits(&work(isa)));
             }
         }
+    }
+
+    #[test]
+    fn exponentials_are_those_of_the_standard_library() {
+        for i in 0..=9000 {
+            let x = -0.01 * i as f32;
+            let expected = if x < -87.0 { 0.0 } else { f64::from(x).exp() };
+            assert!(
+                (f64::from(exp(x)) - expected).abs() <= 2e-7 * expected,
+                "{x}"
+            );
+            for x in [x, -x] {
+                let expected = 1.0 / (1.0 + (-f64::from(x)).exp());
+                assert!((f64::from(sigmoid(x)) - expected).abs() <= 3e-7, "{x}");
+            }
+        }
+        assert!(exp(f32::NAN).is_nan() && sigmoid(f32::NAN).is_nan());
     }
 }

@@ -34,8 +34,8 @@ impl ModelConfig {
     }
 
     /// Bytes that a training step of the kernels needs for this number of patches of `side` x `side`
-    /// pixels, in addition to their own planes: maps, weights, gradients and moments. An estimate,
-    /// to about a third.
+    /// pixels. It counts maps, weights, gradients and moments, but not the patches' own planes. The
+    /// estimate is right to about a third.
     pub fn step_bytes(&self, patches: usize, side: usize) -> u64 {
         let specs = self.weight_specs();
         let maps = specs.iter().filter_map(|spec| {

@@ -8,7 +8,6 @@
 //!   [`step::optimizer`] updates the weights.
 //! - [`record`] writes metrics, TensorBoard events and the progress bar.
 //! - [`tools`] compares variants, finds learning rates and draws charts.
-//! - [`usage`] has the error of a wrong command line.
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod config;
@@ -16,6 +15,5 @@ pub mod record;
 pub mod run;
 pub mod step;
 pub mod tools;
-pub mod usage;
 
 pub use config::Config;

@@ -7,12 +7,11 @@ mod cli;
 use std::process::ExitCode;
 
 use clap::Parser;
-use demc_data::message;
+use demc_data::message::{self, UsageError};
 use demc_data::output::OutputError;
 use demc_infer::compute::{self, IsaError};
 use demc_infer::device::DeviceError;
 use demc_train::config::ConfigError;
-use demc_train::usage::UsageError;
 
 #[global_allocator]
 static ALLOCATOR: demc_model::ops::Recycler = demc_model::ops::Recycler;

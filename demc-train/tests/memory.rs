@@ -6,7 +6,7 @@
 use std::convert::Infallible;
 
 use burn::tensor::Device;
-use demc_data::{Batch, FEATURES, Patch};
+use demc_data::Batch;
 use demc_model::config::{LEVEL_WIDTHS, Reading, Variant};
 use demc_model::ops::{Recycler, used_bytes};
 use demc_train::Config;
@@ -19,24 +19,6 @@ static ALLOCATOR: Recycler = Recycler;
 
 /// Relative tolerance: the estimate only decides whether a step can fit at all.
 const TOLERANCE: f64 = 0.33;
-
-fn batch(size: usize, side: usize) -> Batch {
-    let planes = |channels: usize| vec![0.5; size * channels * side * side];
-    let patch = Patch {
-        scene: 0,
-        y: 0,
-        x: 0,
-    };
-    Batch {
-        size,
-        color_gamma: planes(3),
-        features_z: planes(FEATURES),
-        modulation: None,
-        reference_hdr: planes(3),
-        patch_size: side,
-        patches: vec![patch; size],
-    }
-}
 
 #[test]
 fn the_estimate_of_a_step_agrees_with_the_allocations() {
@@ -66,7 +48,7 @@ fn the_estimate_of_a_step_agrees_with_the_allocations() {
             None,
             device.clone(),
         );
-        let batch = batch(patches, side);
+        let batch = Batch::grey(patches, side);
         for _ in 0..2 {
             let Ok(_) = trainer.step(1e-4, || Ok::<_, Infallible>(batch.clone()));
         }

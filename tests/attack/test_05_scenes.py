@@ -1,8 +1,7 @@
 """Item 5: a resume names the scenes whose files changed."""
 import json
 
-import exr
-from common import Attack
+from common import Attack, write_exr, write_manifest
 
 KEYS = {"reference": "ref", "colour": "R", "feature": "normal", "mask": "mask"}
 
@@ -14,8 +13,8 @@ class Scenes(Attack):
         data.mkdir()
         self.scenes = [("one", "train"), ("two", "train"), ("three", "train"), ("last", "test")]
         for number, (name, _) in enumerate(self.scenes):
-            exr.write(data / f"{name}.exr", R=0.5 + number / 10)
-        exr.manifest(data, *((name, split, name, f"{name}.exr") for name, split in self.scenes))
+            write_exr(data / f"{name}.exr", R=0.5 + number / 10)
+        write_manifest(data, *((name, split, name, f"{name}.exr") for name, split in self.scenes))
         self.data = data
 
     def train(self, *options, steps=4):
@@ -30,7 +29,7 @@ class Scenes(Attack):
             path = self.data / f"{name}.exr"
             whole = path.read_bytes()
             for what, key in KEYS.items():
-                exr.write(path, **{"R": 0.5 + number / 10, key: 0.75})
+                write_exr(path, **{"R": 0.5 + number / 10, key: 0.75})
                 for options in ([], ["--check"]):
                     with self.subTest(scene=name, what=what, options=options):
                         self.assert_refused(self.train("--resume", *options), "run.json", name, "changed since")
@@ -40,7 +39,7 @@ class Scenes(Attack):
     def test_05_all_changed_scenes_are_named_at_once(self):
         self.assertEqual(self.train().code, 0)
         for name in ("one", "last"):
-            exr.write(self.data / f"{name}.exr", ref=0.25)
+            write_exr(self.data / f"{name}.exr", ref=0.25)
         self.assert_refused(self.train("--resume"), "last, one")
 
     def test_05_other_scenes_and_splits_are_named(self):

@@ -2,8 +2,7 @@
 import os
 import shutil
 
-import exr
-from common import Attack
+from common import Attack, write_exr, write_manifest
 
 WHOLE = "configuration and data are valid"
 PROBLEMS = [({"R": 0.0, "G": 0.0, "B": 0.0}, "the noisy image is black"), ({"ref": 0.0}, "the reference is black"),
@@ -18,11 +17,11 @@ class Content(Attack):
         self.data = self.root / "mine"
         self.data.mkdir()
         for number, name in enumerate(("one", "two", "three", "four")):
-            exr.write(self.data / f"{name}.exr", **{"mask": 0.5 + number / 10})
+            write_exr(self.data / f"{name}.exr", **{"mask": 0.5 + number / 10})
         self.list(("one", "train", "one"), ("two", "train", "two"), ("three", "test", "three"))
 
     def list(self, *scenes):
-        exr.manifest(self.data, *((name, split, base, f"{name}.exr") for name, split, base in scenes))
+        write_manifest(self.data, *((name, split, base, f"{name}.exr") for name, split, base in scenes))
 
     def train(self, *options):
         return self.run_program("demc-train", "--config", "tiny.toml", "--run-dir", "r",
@@ -37,7 +36,7 @@ class Content(Attack):
                 for name in ("one", "two", "three"):
                     path = self.data / f"{name}.exr"
                     whole = path.read_bytes()
-                    exr.write(path, **values)
+                    write_exr(path, **values)
                     result = self.train("--check", "--set", f"data.validation={validation}")
                     with self.subTest(words=words, scene=name, validation=validation):
                         self.assertEqual(result.code, 0, result)
@@ -47,7 +46,7 @@ class Content(Attack):
 
     def test_18_a_zero_loss(self):
         for name in ("one", "two", "three", "four"):
-            exr.write(self.data / f"{name}.exr", R=0.0, G=0.0, B=0.0, ref=0.0)
+            write_exr(self.data / f"{name}.exr", R=0.0, G=0.0, B=0.0, ref=0.0)
         self.list(*((name, "train", name) for name in ("one", "two", "three", "four")))
         result = self.train("--set", "train.steps=300", "--set", "run.log_every=300", "--set", "data.validation=0")
         self.assertEqual(result.code, 0, result)
@@ -75,7 +74,7 @@ class Content(Attack):
         os.symlink(".", self.data / "here")
         for file in ("one.exr", "./one.exr", "folder/../one.exr", "hard.exr", "soft.exr", "here/one.exr", str(one)):
             for split in ("test", "train"):
-                exr.manifest(self.data, ("a", "train", "a", "one.exr"), ("b", split, "b", file))
+                write_manifest(self.data, ("a", "train", "a", "one.exr"), ("b", split, "b", file))
                 with self.subTest(file=file, split=split):
                     self.assert_refused(self.train("--check"), "scenes a and b are the same file")
 

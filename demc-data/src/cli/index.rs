@@ -1,5 +1,7 @@
 //! `demc-data index`.
 
+mod rules;
+
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::fs;
 use std::io::Write;
@@ -13,11 +15,10 @@ use demc_data::layout::{MissingPolicies, detect};
 use demc_data::message::{self, printable};
 use demc_data::output::{Directories, Outputs};
 use demc_data::{ChannelLayout, Split, file};
-use glob::Pattern;
-use regex_lite::Regex;
 use serde_json::{Map, Value, json};
 
-use super::{IndexArguments, UsageError};
+use super::IndexArguments;
+use rules::{Entry, Rules};
 
 /// Problems that an error names; the others are counted.
 const PROBLEMS_LISTED: usize = 8;
@@ -235,151 +236,6 @@ fn header(root: &Path, relative: &Path, chosen: Option<&(&str, ChannelLayout)>) 
     })
 }
 
-/// The rules for splits and base scenes.
-struct Rules {
-    test: Vec<(String, Pattern)>,
-    base: Option<Regex>,
-}
-
-/// A scene of the new manifest.
-struct Entry {
-    name: String,
-    split: Split,
-    base: String,
-    file: String,
-    width: usize,
-    height: usize,
-}
-
-impl Rules {
-    fn of(args: &IndexArguments) -> Result<Self, UsageError> {
-        let pattern = |text: &String| match Pattern::new(text) {
-            Ok(pattern) => Ok((text.clone(), pattern)),
-            Err(error) => Err(UsageError(format!("--test {}: {error}", printable(text)))),
-        };
-        let regex = |text: &String| {
-            let shown = printable(text);
-            let regex =
-                Regex::new(text).map_err(|error| UsageError(format!("--base {shown}: {error}")))?;
-            // The whole match counts as a group.
-            match regex.captures_len() {
-                2 => Ok(regex),
-                groups => Err(UsageError(format!(
-                    "--base {shown}: {} groups, expected 1",
-                    groups - 1
-                ))),
-            }
-        };
-        Ok(Self {
-            test: args.test.iter().map(pattern).collect::<Result<_, _>>()?,
-            base: args.base.as_ref().map(regex).transpose()?,
-        })
-    }
-
-    /// The scenes of these files.
-    fn scenes(&self, root: &Path, found: &[Found]) -> Result<Vec<Entry>> {
-        let mut problems = Vec::new();
-        for (text, pattern) in &self.test {
-            if !found.iter().any(|found| matches(pattern, &found.file)) {
-                problems.push(format!("--test {text} matches no file"));
-            }
-        }
-        let mut stems: HashMap<&str, usize> = HashMap::new();
-        for found in found {
-            *stems.entry(stem(&found.file)).or_default() += 1;
-        }
-        let unique = stems.values().all(|count| *count == 1);
-        let mut scenes = Vec::with_capacity(found.len());
-        let mut names: HashMap<String, &str> = HashMap::new();
-        for Found {
-            file,
-            width,
-            height,
-            ..
-        } in found
-        {
-            let path = file
-                .rsplit_once('.')
-                .map_or(file.as_str(), |(path, _)| path);
-            let name = match unique {
-                true => stem(file).to_owned(),
-                false => path.replace('/', "-"),
-            };
-            if let Some(other) = names.insert(name.clone(), file) {
-                problems.push(format!("{other} and {file} both get the name {name}"));
-            }
-            let base = match &self.base {
-                None => Some(base(path)),
-                Some(regex) => regex
-                    .captures(path)
-                    .and_then(|groups| groups.get(1))
-                    .map(|group| group.as_str()),
-            };
-            let base = base.filter(|base| !base.is_empty());
-            if base.is_none() {
-                problems.push(format!("{file}: --base finds no base scene in {path}"));
-            }
-            let test = self.test.iter().any(|(_, test)| matches(test, file));
-            scenes.push(Entry {
-                name,
-                split: if test { Split::Test } else { Split::Train },
-                base: base.unwrap_or_default().to_owned(),
-                file: file.clone(),
-                width: *width,
-                height: *height,
-            });
-        }
-        problems.extend(leaks(&scenes));
-        refuse(root, problems)?;
-        Ok(scenes)
-    }
-}
-
-/// Base scenes in both splits.
-fn leaks(scenes: &[Entry]) -> Vec<String> {
-    let mut examples: BTreeMap<&str, BTreeMap<Split, &str>> = BTreeMap::new();
-    for scene in scenes {
-        let files = examples.entry(&scene.base).or_default();
-        files.entry(scene.split).or_insert(&scene.file);
-    }
-    let leaks = examples.into_iter().filter(|(_, files)| files.len() > 1);
-    let phrase = |(base, files): (&str, BTreeMap<Split, &str>)| {
-        let files: Vec<String> = files
-            .into_iter()
-            .map(|(split, file)| format!("{file} is in {split}"))
-            .collect();
-        let files = files.join(", ");
-        format!("base scene {base} would be in both splits ({files}); change --test or --base")
-    };
-    leaks.map(phrase).collect()
-}
-
-fn matches(pattern: &Pattern, file: &str) -> bool {
-    let name = file.rsplit_once('/').map_or(file, |(_, name)| name);
-    pattern.matches(file) || pattern.matches(name)
-}
-
-/// The file name without extension.
-fn stem(file: &str) -> &str {
-    let name = file.rsplit_once('/').map_or(file, |(_, name)| name);
-    name.rsplit_once('.').map_or(name, |(stem, _)| stem)
-}
-
-/// The file name without the number of a frame or view at its end; the directory if only a number
-/// is left. `path` has no extension.
-fn base(path: &str) -> &str {
-    let (directory, name) = path.rsplit_once('/').unwrap_or(("", path));
-    let numberless = name.trim_end_matches(|c: char| c.is_ascii_digit());
-    if numberless.len() == name.len() {
-        return name;
-    }
-    match numberless.trim_end_matches(['-', '_', '.', ' ']) {
-        "" if directory.is_empty() => name,
-        "" => directory,
-        base => base,
-    }
-}
-
 fn refuse(root: &Path, mut problems: Vec<String>) -> Result<()> {
     let more = problems.len().saturating_sub(PROBLEMS_LISTED);
     problems.truncate(PROBLEMS_LISTED);
@@ -389,27 +245,5 @@ fn refuse(root: &Path, mut problems: Vec<String>) -> Result<()> {
     match problems.is_empty() {
         true => Ok(()),
         false => bail!("{}: {}", root.display(), problems.join("; ")),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_base_is_the_name_without_its_number() {
-        for (path, expected) in [
-            ("kitchen-0", "kitchen"),
-            ("a/kitchen.0012", "kitchen"),
-            ("kitchen", "kitchen"),
-            ("living-room-2-11", "living-room-2"),
-            ("shot_0001", "shot"),
-            ("frame0001", "frame"),
-            ("kitchen/0001", "kitchen"),
-            ("houses/kitchen/0001", "houses/kitchen"),
-            ("0001", "0001"),
-        ] {
-            assert_eq!(base(path), expected, "{path}");
-        }
     }
 }

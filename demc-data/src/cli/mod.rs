@@ -7,12 +7,12 @@ mod merge;
 mod stats;
 
 use std::ffi::OsString;
-use std::fmt;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::{Args, Parser, Subcommand};
+pub use demc_data::message::UsageError;
 use demc_data::{Split, message};
 
 /// Prepares and inspects images and data sets for training a DEMC denoiser.
@@ -171,18 +171,6 @@ impl Cli {
         }
     }
 }
-
-/// Arguments that contradict each other or the files on disk.
-#[derive(Debug)]
-pub struct UsageError(String);
-
-impl fmt::Display for UsageError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-impl std::error::Error for UsageError {}
 
 /// Prints an error as one line on standard error.
 pub fn report(error: &anyhow::Error) {

@@ -3,8 +3,8 @@
 //!
 //! The weights are tensors by name ([`Names`]: Burn's or PyTorch's) in f32 or f16 ([`Precision`];
 //! batch normalisation stays f32). The header's metadata has one key, `demc`: [`BundleMeta`] as
-//! JSON, with the keys `names` and `sha256` added ([`checksum`]). A single key keeps the bytes reproducible, because the
-//! `safetensors` crate writes metadata in random order.
+//! JSON, with the keys `names` and `sha256` added ([`checksum`]). A single key keeps the bytes
+//! reproducible, because the `safetensors` crate writes metadata in random order.
 //!
 //! Statistics are stored with the weights because every output value depends on them. Weights
 //! without them do not load, and no flag replaces them. The layout is that of the training data;

@@ -131,14 +131,15 @@ fn image(
     width: usize,
     height: usize,
 ) -> Result<ImageCost, memory::TooLarge> {
+    let padded = height.next_multiple_of(DOWNSAMPLING) * width.next_multiple_of(DOWNSAMPLING);
     let tiles = bundle.tiles(height, width, tiling, Ensemble::One)?;
     let (tall, wide) = tiles.largest();
-    let padded = height.next_multiple_of(DOWNSAMPLING) * width.next_multiple_of(DOWNSAMPLING);
-    let (mut flops, mut flops_whole) = (0.0, 0.0);
-    // The albedo filter's tiles are always exact.
-    for (network, tiling) in bundle.networks().zip([*tiling, tiling.exact()]) {
-        let per_pixel = network.meta.model.flops_per_pixel();
-        let tiles = network.tiles(height, width, &tiling, Ensemble::One)?;
+    let per_pixel = bundle.meta.model.flops_per_pixel();
+    let mut flops = per_pixel * tiles.computed_pixels() as f64;
+    let mut flops_whole = per_pixel * padded as f64;
+    if let Some(filter) = &bundle.albedo_filter {
+        let per_pixel = filter.meta.model.flops_per_pixel();
+        let tiles = filter.tiles(height, width, &tiling.exact(), Ensemble::One)?;
         flops += per_pixel * tiles.computed_pixels() as f64;
         flops_whole += per_pixel * padded as f64;
     }

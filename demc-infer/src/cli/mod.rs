@@ -24,6 +24,7 @@ use std::path::Path;
 
 use clap::{Parser, Subcommand};
 use demc_data::message;
+pub use demc_data::message::UsageError;
 use demc_data::output::{Directories, OutputError, Outputs};
 
 /// Use a trained DEMC network: denoise and score renderings, export and import weights.
@@ -50,11 +51,6 @@ enum Verb {
     Inspect(inspect::Arguments),
     Report(report::Arguments),
 }
-
-/// An invalid command line: exit code 2.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct UsageError(String);
 
 /// Runs the command.
 pub fn run(arguments: Arguments) -> anyhow::Result<()> {

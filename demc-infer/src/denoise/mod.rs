@@ -237,8 +237,9 @@ impl Bundle {
     }
 }
 
-/// Number of planes that are in memory beside a pass: the denoised colour and the filtered albedo; with
-/// alpha, also alpha as grey, its denoised image, the result, and the mask of its edges.
+/// Number of planes that are in memory beside a pass: the denoised colour and the filtered albedo.
+/// With alpha, there are also alpha as grey, its denoised image, the result, and the mask of its
+/// edges.
 fn outputs(frame: &Frame) -> usize {
     match frame.alpha {
         Some(_) => 4 * COLOR_CHANNELS + 2,

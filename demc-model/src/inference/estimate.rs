@@ -278,8 +278,8 @@ impl PeakEstimate<'_> {
         }
     }
 
-    /// Working memory of a kernel head at a level: the logits of a band, the filtered image with its
-    /// blend weight, and the blend, which needs the output below and its own correction.
+    /// Working memory of a kernel head at a level. It has the filtered image with its blend weight
+    /// and the output below; then either the logits of a band, or the blend and its correction.
     fn filter(&self, level: usize) -> usize {
         if self.config.head != Head::Kernel || level >= KERNEL_LEVELS {
             return 0;

@@ -6,6 +6,7 @@ use std::ops::Range;
 use burn::backend::flex::FlexTensor;
 use demc_kernels::conv1x1::{self, Epilogue};
 use demc_kernels::{Grid, Isa, blend, filter5x5, grid, memory, power};
+use rayon::prelude::*;
 
 use super::band::bands;
 use super::folded::FoldedConv;
@@ -25,11 +26,8 @@ pub(super) struct KernelHead {
 }
 
 impl KernelHead {
-    /// The head of `model` for planar images in gamma space; `None` for another head.
-    pub(super) fn new(isa: Isa, model: &Denoiser, grid: Grid, color: &FlexTensor) -> Option<Self> {
-        if model.decoder.head.is_some() {
-            return None;
-        }
+    /// The kernel head of `model` for planar images in gamma space.
+    pub(super) fn new(isa: Isa, model: &Denoiser, grid: Grid, color: &FlexTensor) -> Self {
         let kernels = model.decoder.kernels.iter().rev();
         let mut image = FeatureMaps::new(grid, COLOR_CHANNELS);
         grid::nhwc_from_nchw(grid, color.storage::<f32>(), &mut image.values);
@@ -41,12 +39,12 @@ impl KernelHead {
             blend::halve(above.grid, &above.values, &mut image.values);
             scales.push(image);
         }
-        Some(KernelHead {
+        KernelHead {
             isa,
             convs: kernels.map(|conv| FoldedConv::conv(conv, None)).collect(),
             scales,
             out: None,
-        })
+        }
     }
 
     /// The image of a level to be filtered into.
@@ -104,11 +102,11 @@ impl KernelHead {
     /// The output in gamma space, planar.
     pub(super) fn finish(self) -> Vec<f32> {
         let mut out = self.out.expect("all levels are filtered");
-        for value in &mut out.values {
+        out.values.par_iter_mut().for_each(|value| {
             if *value <= DARKEST {
                 *value = 0.0;
             }
-        }
+        });
         power::positive_powers(self.isa, &mut out.values, 1.0 / GAMMA);
         let mut planar = memory::buffer(out.values.len());
         grid::nchw_from_nhwc(out.grid, &out.values, &mut planar);

@@ -82,10 +82,10 @@ fn forward_with(
     };
     let takes_features = model.config().variant.spec().takes_features();
     let images = InputImages::new(color_gamma, takes_features.then_some(features_z));
-    let (grid, color) = (images.grid, images.color());
+    let grid = images.grid;
+    let color = model.decoder.head.is_none().then(|| images.color());
     let encoded = pass.encode(images);
-    let head = KernelHead::new(pass.isa, model, grid, &color);
-    drop(color);
+    let head = color.map(|color| KernelHead::new(pass.isa, model, grid, &color));
     let out = pass.decode(encoded, head);
     let shape = [batch, COLOR_CHANNELS, height, width];
     Tensor::from_primitive::<Flex>(FlexTensor::from_data(TensorData::new(out, shape)))

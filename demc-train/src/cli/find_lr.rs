@@ -4,14 +4,13 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
+use demc_data::message::{UsageError, printable};
 use demc_data::output::{Directories, Outputs};
 use demc_train::config::Config;
 use demc_train::record::progress::{StepProgress, say};
-use demc_train::run::data::RunData;
-use demc_train::run::inputs;
+use demc_train::run::data::{RunData, protect_inputs};
 use demc_train::tools::chart::with_extension;
 use demc_train::tools::find_lr::{RateRange, sweep};
-use demc_train::usage::UsageError;
 
 use super::compute::ComputeArguments;
 
@@ -82,7 +81,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         .unwrap_or_else(|| Path::new("runs/find-lr").join(name));
     let mut outputs = Outputs::default();
     let file = std::slice::from_ref(&arguments.config);
-    inputs::protect(&mut outputs, file, &config)?;
+    protect_inputs(&mut outputs, file, &config)?;
     for extension in ["csv", "svg"] {
         outputs.claim(&with_extension(&stem, extension)?, true)?;
     }
@@ -90,7 +89,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     outputs.prepare(Directories::Create)?;
     let data = RunData::open(&config)?;
     for warning in &data.warnings {
-        say(format!("warning: {warning}"));
+        say(format!("warning: {}", printable(warning)));
     }
     say(format!(
         "data: {} in {}",

@@ -5,8 +5,8 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use demc_data::content::listed;
 use demc_data::file::write_whole;
+use demc_data::message::short_list;
 use demc_model::config::DETAIL_CHANNELS;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -57,6 +57,19 @@ pub struct MetricsLine {
 }
 
 impl MetricsLine {
+    /// The line of the terminal; `is_best` marks the best validation so far.
+    pub fn describe(&self, is_best: bool) -> String {
+        let MetricsLine { step, loss, lr, .. } = self;
+        let mut text = format!("step {step:>6}  loss {loss:.4}  lr {lr:.2e}");
+        if let (Some(relmse), Some(ssim)) = (self.valid_relmse, self.valid_ssim) {
+            text += &format!("  validation RelMSE {relmse:.4}  SSIM {ssim:.4}");
+        }
+        if is_best {
+            text += "  best";
+        }
+        text
+    }
+
     /// The numbers as TensorBoard scalars.
     pub fn scalars(&self) -> Vec<(&'static str, f64)> {
         let always = [
@@ -180,8 +193,7 @@ pub fn read_lines<T: DeserializeOwned>(bytes: &[u8]) -> StoredLines<'_, T> {
 pub fn damaged_lines(numbers: &[usize]) -> String {
     let plural = if numbers.len() == 1 { "" } else { "s" };
     let names: Vec<String> = numbers.iter().map(usize::to_string).collect();
-    let names: Vec<&str> = names.iter().map(String::as_str).collect();
-    format!("damaged line{plural} {}", listed(&names))
+    format!("damaged line{plural} {}", short_list(&names))
 }
 
 #[cfg(test)]

@@ -1,17 +1,20 @@
 //! The data of a run: the scenes of each split, and the statistics of the training scenes.
 
 use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use demc_data::checksum::sha256_of;
 use demc_data::content;
 use demc_data::exr::ExrFile;
 use demc_data::frame::{FramePlanes, Presence};
+use demc_data::message::short_list;
+use demc_data::output::Outputs;
 use demc_data::{
     ChannelLayout, DataConfig, Dataset, Dropout, Normalizer, PatchSource, Ranges, Scene, Split,
     Statistics,
 };
-use demc_infer::bundle::BundleMeta;
+use demc_infer::bundle::{BundleMeta, locate};
 use demc_model::ModelConfig;
 
 use crate::config::Config;
@@ -57,8 +60,33 @@ fn copies(checksums: &BTreeMap<String, String>) -> Vec<String> {
     }
     let groups = scenes.values().filter(|names| names.len() > 1);
     groups
-        .map(|names| format!("copies of one image: {}", content::listed(names)))
+        .map(|names| format!("copies of one image: {}", short_list(names)))
         .collect()
+}
+
+/// Protects the configuration `files` and what a run of `config` reads: data set, channel layout,
+/// initial weights.
+///
+/// # Errors
+/// No data set.
+pub fn protect_inputs(
+    outputs: &mut Outputs,
+    files: &[PathBuf],
+    config: &Config,
+) -> Result<(), demc_data::Error> {
+    for file in files {
+        outputs.protect(file, "the configuration");
+    }
+    outputs.protect(Path::new(&config.data.layout), "the channel layout");
+    for file in config
+        .train
+        .init
+        .iter()
+        .flat_map(|init| locate::files(init))
+    {
+        outputs.protect(&file, "the initial weights");
+    }
+    outputs.protect_dataset(&config.data.root)
 }
 
 impl RunData {

@@ -3,12 +3,9 @@
 pub mod checkpoint;
 pub mod data;
 pub mod initial;
-pub mod inputs;
-pub mod memory;
 pub mod run_dir;
 pub mod run_record;
 pub mod session;
-mod session_clock;
 pub mod signals;
 pub mod training;
 pub mod validation;

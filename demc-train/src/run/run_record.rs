@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use anyhow::ensure;
-use demc_data::content::listed;
+use demc_data::message::short_list;
 use demc_data::{ChannelLayout, Normalizer, Scene};
 use serde::{Deserialize, Serialize};
 
@@ -123,7 +123,7 @@ impl RunRecord {
             moved.is_empty(),
             "{}: the run started with different scenes or splits: {}; restore the data set, or start a new run",
             path.display(),
-            listed(&moved)
+            short_list(&moved)
         );
         let changed = data.checksums.iter().filter(|(name, sum)| {
             let before = self.checksums.get(*name);
@@ -134,7 +134,7 @@ impl RunRecord {
             changed.is_empty(),
             "{}: files of scenes changed since the run started: {}; restore them, or start a new run",
             path.display(),
-            listed(&changed)
+            short_list(&changed)
         );
         Ok(())
     }

@@ -11,11 +11,10 @@ use demc_infer::evaluate::Report;
 use crate::config::Config;
 use crate::run::checkpoint::store::{CheckpointSearch, CheckpointStore};
 use crate::run::checkpoint::{self, Checkpoint};
-use crate::run::data::RunData;
+use crate::run::data::{RunData, protect_inputs};
 use crate::run::run_dir::{self, RunDir};
 use crate::run::training::{LoopEnd, TrainingRun};
-use crate::run::{inputs, memory};
-use crate::tools::estimate::DurationEstimate;
+use crate::tools::estimate::{DurationEstimate, check_memory};
 
 /// A run that can start, and what the user should know about it.
 pub struct Session {
@@ -83,7 +82,7 @@ impl Session {
             false => None,
         };
         let data = RunData::open(&config)?;
-        memory::check(&config, device)?;
+        check_memory(&config, device)?;
         if resume {
             dir.check_scenes(&data)?;
         }
@@ -125,7 +124,7 @@ impl Session {
         // Only a new run reads its initial weights.
         config.train.init.take_if(|_| self.run.initial().is_none());
         let mut outputs = Outputs::default();
-        inputs::protect(&mut outputs, files, &config)?;
+        protect_inputs(&mut outputs, files, &config)?;
         for file in run_dir::replaced_files(config.run_dir()) {
             outputs.claim(&file, true)?;
         }

@@ -15,12 +15,13 @@ use crate::config::{Config, OnNan};
 use crate::record::metrics_log::MetricsLine;
 use crate::record::recorder::{Recorder, timed};
 use crate::run::checkpoint::store::{CheckpointRetention, CheckpointStore};
-use crate::run::checkpoint::{self, BestValidation, Checkpoint, LoopState, MetricSums};
+use crate::run::checkpoint::{
+    self, BestValidation, Checkpoint, LoopState, MetricSums, SessionClock,
+};
 use crate::run::data::RunData;
 use crate::run::initial::{InitialNetwork, InitialWeights, initial_network};
 use crate::run::run_dir::{RunDir, SCORES};
 use crate::run::run_record::RunFacts;
-use crate::run::session_clock::SessionClock;
 use crate::run::signals::Signals;
 use crate::run::validation::{self, Validation};
 use crate::run::warnings::LoopFacts;
@@ -192,7 +193,8 @@ impl TrainingRun {
                 let line = self.metrics_line(lr, validation.as_ref());
                 let watch = &mut self.state.watch;
                 warnings.extend(line.dormant.and_then(|share| watch.dormant(share)));
-                recorder.line(line, &self.describe(&line))?;
+                let is_best = self.state.best.is_some_and(|best| best.step == step);
+                recorder.line(line, &line.describe(is_best))?;
                 self.state.since_log = MetricSums::default();
             }
             for warning in warnings {
@@ -364,23 +366,9 @@ impl TrainingRun {
         }
     }
 
-    /// The line of the terminal for a line of the log.
-    fn describe(&self, line: &MetricsLine) -> String {
-        let MetricsLine { step, loss, lr, .. } = line;
-        let mut text = format!("step {step:>6}  loss {loss:.4}  lr {lr:.2e}");
-        if let (Some(relmse), Some(ssim)) = (line.valid_relmse, line.valid_ssim) {
-            text += &format!("  validation RelMSE {relmse:.4}  SSIM {ssim:.4}");
-        }
-        if self.state.best.is_some_and(|best| best.step == *step) {
-            text += "  best";
-        }
-        text
-    }
-
     fn bundle(&self, model: Denoiser) -> Bundle {
-        let meta = self.data.meta(self.config.model, self.state.step);
         Bundle {
-            meta,
+            meta: self.data.meta(self.config.model, self.state.step),
             model,
             albedo_filter: self.albedo_filter.clone(),
         }

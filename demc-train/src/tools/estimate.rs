@@ -1,11 +1,14 @@
-//! Estimates the duration of a run from a few discarded training steps.
+//! Estimates the duration of a run, from a few discarded training steps, and the memory of a step.
 
 use std::convert::Infallible;
 use std::fmt;
 use std::time::Instant;
 
+use anyhow::ensure;
 use burn::tensor::Device;
-use demc_data::{Batch, FEATURES, Patch};
+use demc_data::{Batch, FEATURES};
+use demc_infer::memory;
+use demc_model::config::COLOR_CHANNELS;
 
 use crate::config::Config;
 use crate::run::data::RunData;
@@ -60,7 +63,7 @@ impl DurationEstimate {
             started.elapsed().as_secs_f64()
         };
         let mut time = |patches: usize| {
-            let batch = grey_batch(patches, config.data.patch_size);
+            let batch = Batch::grey(patches, config.data.patch_size);
             let (mut least, mut spent, mut times) = (f64::INFINITY, 0.0, 0);
             while times < 2 && spent < LONG_STEP || times < REPETITIONS && spent < TIME_LIMIT {
                 let time = time_step(&batch);
@@ -99,22 +102,40 @@ fn patch_time(one: f64, patches: usize, time: f64) -> f64 {
     }
 }
 
-fn grey_batch(size: usize, side: usize) -> Batch {
-    let planes = |channels: usize| vec![0.5; size * channels * side * side];
-    let patch = Patch {
-        scene: 0,
-        y: 0,
-        x: 0,
-    };
-    Batch {
-        size,
-        color_gamma: planes(3),
-        features_z: planes(FEATURES),
-        modulation: None,
-        reference_hdr: planes(3),
-        patch_size: side,
-        patches: vec![patch; size],
+/// Refuses a configuration whose steps need clearly more than the available memory.
+///
+/// `device` has no autodiff. On a device other than the CPU, the memory is unknown and not checked.
+///
+/// # Errors
+/// The step does not fit, even if the estimate is a third too large.
+pub fn check_memory(config: &Config, device: &Device) -> anyhow::Result<()> {
+    if *device != Device::flex() {
+        return Ok(());
     }
+    let Some(available) = memory::available() else {
+        return Ok(());
+    };
+    let needed = step_bytes(config);
+    let batch = config.data.batch_size;
+    ensure!(
+        needed / 4 * 3 <= available,
+        "data.batch_size = {batch}: a training step needs about {} MiB; {} MiB are available; lower it and \
+         raise train.grad_accumulation",
+        needed >> 20,
+        available >> 20
+    );
+    Ok(())
+}
+
+/// Estimated bytes of a training step: the network's, and the batches that wait.
+fn step_bytes(config: &Config) -> u64 {
+    let data = &config.data;
+    // Of each worker, one batch waits while it makes the next. One is in use.
+    let batches = (2 * data.workers + 1) as u64;
+    let planes = FEATURES + 2 * COLOR_CHANNELS;
+    let patch = (planes * data.patch_size * data.patch_size * size_of::<f32>()) as u64;
+    let waiting = batches * data.batch_size as u64 * patch;
+    config.model.step_bytes(data.batch_size, data.patch_size) + waiting
 }
 
 impl fmt::Display for DurationEstimate {

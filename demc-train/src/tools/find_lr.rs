@@ -16,11 +16,11 @@ use demc_data::{Batch, BatchLoader};
 use crate::config::Config;
 use crate::run::data::RunData;
 use crate::run::initial::{InitialNetwork, initial_network};
-use crate::run::memory;
 use crate::step::optimizer::Optimizer;
 use crate::step::trainer::Trainer;
 use crate::tools::chart::figure::{AxisScale, Figure, LinePanel, Series};
 use crate::tools::chart::with_extension;
+use crate::tools::estimate::check_memory;
 
 /// Weight of the previous value in the smoothed ratio; ours.
 const SMOOTH: f64 = 0.9;
@@ -83,7 +83,7 @@ pub fn sweep(
     device: &Device,
     mut on_step: impl FnMut(&SweepPoint),
 ) -> anyhow::Result<Sweep> {
-    memory::check(config, device)?;
+    check_memory(config, device)?;
     let source = Arc::new(data.patch_source(config)?);
     let mut loader = BatchLoader::new(source, 0);
     let device = device.clone().autodiff();

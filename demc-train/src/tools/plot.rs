@@ -7,9 +7,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 use serde::Deserialize;
 
+use demc_data::message::UsageError;
+
 use crate::record::metrics_log::{StoredLines, damaged_lines, read_lines};
 use crate::tools::chart::figure::{AxisScale, Figure, LinePanel, Series};
-use crate::usage::UsageError;
 
 const METRICS: &str = "metrics.jsonl";
 

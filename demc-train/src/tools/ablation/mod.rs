@@ -20,8 +20,8 @@ use crate::config::Config;
 use crate::record::metrics_log;
 use crate::record::progress::say;
 use crate::run::checkpoint::store::CheckpointStore;
+use crate::run::data::protect_inputs;
 use crate::run::initial::read_init;
-use crate::run::inputs;
 use crate::run::run_dir::SCORES;
 use crate::run::session::{Session, SessionOptions, SessionOutcome};
 use comparison::{Comparison, FinishedRun};
@@ -112,7 +112,7 @@ fn check_init(spec: &AblationSpec) -> anyhow::Result<()> {
 fn check_outputs(spec: &AblationSpec) -> anyhow::Result<()> {
     let mut outputs = Outputs::default();
     for variant in &spec.variants {
-        inputs::protect(&mut outputs, &spec.files, &variant.config)?;
+        protect_inputs(&mut outputs, &spec.files, &variant.config)?;
     }
     for file in table::files(&spec.dir) {
         outputs.claim(&file, true)?;

@@ -1,0 +1,121 @@
+//! Comparison with the plain sum, on every path.
+
+use super::*;
+use crate::reference;
+use crate::testing::{
+    assert_close, assert_within, bits, f64s, few, grids, pattern, same_on_any_number_of_threads,
+};
+
+fn logits(grid: Grid, channels: usize) -> Vec<f32> {
+    pattern(grid.pixels() * channels, 5)
+        .iter()
+        .map(|x| 4.0 * x)
+        .collect()
+}
+
+#[test]
+fn it_is_the_plain_sum_on_every_path() {
+    for grid in grids() {
+        let x = pattern(grid.pixels() * COLORS, 1);
+        for channels in [TAPS, TAPS + 1] {
+            let logits = logits(grid, channels);
+            let expected = reference::filter5x5(grid, &f64s(&x), &f64s(&logits));
+            for isa in Isa::available() {
+                let mut y = vec![f32::NAN; expected.len()];
+                forward(isa, grid, &x, &logits, &mut y);
+                assert_close(&format!("{isa} {grid:?}"), &y, &expected);
+            }
+        }
+    }
+}
+
+/// Central differences of the float64 loops.
+#[test]
+fn the_gradient_is_that_of_differences() {
+    for grid in few(grids(), 1) {
+        let x = pattern(grid.pixels() * COLORS, 1);
+        let logits = logits(grid, TAPS + 1);
+        let dy = pattern(grid.pixels() * (COLORS + 1), 3);
+        let sum = |logits: &[f64]| -> f64 {
+            let y = reference::filter5x5(grid, &f64s(&x), logits);
+            y.iter().zip(&dy).map(|(y, dy)| y * f64::from(*dy)).sum()
+        };
+        let mut found = vec![f32::NAN; logits.len()];
+        backward(Isa::current(), grid, &x, &logits, &dy, &mut found);
+        let step = (logits.len() / 300).max(1);
+        for i in (0..logits.len()).step_by(step) {
+            let mut moved = f64s(&logits);
+            moved[i] += 1e-4;
+            let above = sum(&moved);
+            moved[i] -= 2e-4;
+            let expected = (above - sum(&moved)) / 2e-4;
+            assert_within(&format!("{grid:?} {i}"), &[found[i]], &[expected], 1e-6);
+        }
+    }
+}
+
+#[test]
+#[cfg_attr(miri, ignore = "takes minutes")]
+fn bits_depend_neither_on_the_path_nor_on_the_threads_nor_on_bands() {
+    let grid = Grid {
+        batch: 2,
+        height: 50,
+        width: 37,
+    };
+    let x = pattern(grid.pixels() * COLORS, 1);
+    let logits = logits(grid, TAPS + 1);
+    let dy = pattern(grid.pixels() * (COLORS + 1), 3);
+    let work = |isa| {
+        let (mut y, mut d) = (vec![0.0; dy.len()], vec![0.0; logits.len()]);
+        forward(isa, grid, &x, &logits, &mut y);
+        backward(isa, grid, &x, &logits, &dy, &mut d);
+        (bits(&y), bits(&d))
+    };
+    for isa in Isa::available() {
+        assert!(work(isa) == work(Isa::Portable), "{isa}");
+        same_on_any_number_of_threads(|| work(isa));
+    }
+    let image = grid.height * grid.width;
+    let (mut whole, mut band) = (vec![0.0; dy.len()], vec![0.0; 20 * grid.width * 4]);
+    forward(Isa::current(), grid, &x, &logits, &mut whole);
+    let rows = 7 * grid.width..27 * grid.width;
+    forward_rows(
+        Isa::current(),
+        grid,
+        &x[..image * COLORS],
+        7..27,
+        &logits[rows.start * (TAPS + 1)..rows.end * (TAPS + 1)],
+        &mut band,
+    );
+    assert_eq!(bits(&band), bits(&whole[rows.start * 4..rows.end * 4]));
+}
+
+#[test]
+fn a_flat_image_stays_flat_and_extreme_logits_select_one_pixel() {
+    let grid = Grid {
+        batch: 1,
+        height: 4,
+        width: 6,
+    };
+    let mut y = vec![0.0; grid.pixels() * COLORS];
+    forward(
+        Isa::current(),
+        grid,
+        &[0.7; 72],
+        &logits(grid, TAPS),
+        &mut y,
+    );
+    assert!(y.iter().all(|y| (y - 0.7).abs() < 1e-6));
+    let x = pattern(grid.pixels() * COLORS, 1);
+    let mut centre = vec![-1000.0; grid.pixels() * TAPS];
+    centre
+        .iter_mut()
+        .skip(TAPS / 2)
+        .step_by(TAPS)
+        .for_each(|logit| *logit = 1000.0);
+    forward(Isa::current(), grid, &x, &centre, &mut y);
+    assert_eq!(y, x);
+    centre[0] = f32::NAN;
+    forward(Isa::current(), grid, &x, &centre, &mut y);
+    assert!(y[..COLORS].iter().all(|y| y.is_nan()) && y[COLORS..].iter().all(|y| y.is_finite()));
+}
