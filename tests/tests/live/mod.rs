@@ -110,6 +110,15 @@ pub fn random_bundle(
     };
     let device = Device::flex();
     let mut weights = config.init(rng, [0.5, 0.4, 0.3], &device).weights();
+    let move_by = match config.head {
+        Head::Grey | Head::Xavier => move_by,
+        // Positive changes make maps of 1e6. A softmax of such logits selects one pixel, and rounding
+        // decides which. The output is never black, so no ReLU must be kept open.
+        Head::Kernel => {
+            let half = (move_by.end - move_by.start) / 2.0;
+            -half..half
+        }
+    };
     for Weight { data, .. } in &mut weights {
         data.iter_mut()
             .for_each(|value| *value += rng.random_range(move_by.clone()));
