@@ -21,7 +21,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use crate::file::{check_directory, check_replaceable, remove_abandoned, target_of};
-use crate::{Dataset, Error};
+use crate::{Dataset, Error, Scene};
 
 /// The files of a command: those that it reads, and those that it will write.
 #[derive(Debug, Default)]
@@ -105,16 +105,17 @@ impl Outputs {
             .or_insert_with(|| what.to_owned());
     }
 
-    /// Notes the manifest and the scenes of the data set in `root`.
+    /// Notes the manifest and the scenes of the data set in `root`. Returns the scenes.
     ///
     /// # Errors
     /// As [`Dataset::list`].
-    pub fn protect_dataset(&mut self, root: &Path) -> Result<(), Error> {
+    pub fn protect_dataset(&mut self, root: &Path) -> Result<Vec<Scene>, Error> {
         self.protect(&root.join("manifest.json"), "the manifest");
-        for scene in Dataset::list(root)? {
+        let scenes = Dataset::list(root)?;
+        for scene in &scenes {
             self.protect(&scene.path, &format!("scene {}", scene.name));
         }
-        Ok(())
+        Ok(scenes)
     }
 
     /// Notes a file that the command will write. An existing one needs `overwrite`.

@@ -100,8 +100,9 @@ impl Jobs {
         files.try_for_each(|file| outputs.claim(file, overwrite || self.directory))
     }
 
-    /// Removes what exists in the output directory, also from `outputs`. Files are written atomically, so an existing
-    /// output is finished, unless its input is newer. Then its preview is written again, too.
+    /// Removes what exists in the output directory, also from `outputs`. Files are written
+    /// atomically, so an existing output is finished, unless its input is newer. Then its preview is
+    /// written again, too.
     pub fn skip_done(&mut self, outputs: &mut Outputs) {
         let before = self.list.len();
         for Job {

@@ -73,8 +73,7 @@ impl Scenes {
         let mut outputs = Outputs::default();
         self.model.protect(&mut outputs);
         self.layout.protect(&mut outputs);
-        outputs.protect_dataset(&self.data)?;
-        let scenes = Dataset::list(&self.data)?;
+        let scenes = outputs.protect_dataset(&self.data)?;
         for baseline in &self.baselines {
             let what = format!("an image of baseline {}", baseline.name);
             for scene in &scenes {

@@ -86,7 +86,8 @@ pub fn protect_inputs(
     {
         outputs.protect(&file, "the initial weights");
     }
-    outputs.protect_dataset(&config.data.root)
+    outputs.protect_dataset(&config.data.root)?;
+    Ok(())
 }
 
 impl RunData {
