@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import numpy as np
 from furniture import Furnished
-from patterns import Rng, mosaic, sky
+from patterns import Rng, mosaic
 from stage import square_film
 from variant import mi
 
 
 class Room(Furnished):
     """One room."""
+
+    picture = staticmethod(mosaic)
 
     def __init__(self, rng: Rng, grained: float = 0.0, grains: Rng | None = None) -> None:
         self.size = np.array([rng.uniform(3, 9), rng.uniform(3, 9), rng.uniform(2.3, 3.8)])
@@ -26,7 +28,7 @@ class Room(Furnished):
 
         windows = rng.random() < 0.75
         self.shell(windows)
-        self.scene["sky"] = sky(rng, 1.0 if windows else 0.2)
+        self.scene["sky"] = self.sky(rng, 1.0 if windows else 0.2)
         if not windows or rng.random() < 0.35:
             self.lamps()
         self.furnish()
@@ -37,7 +39,7 @@ class Room(Furnished):
         """Floor, ceiling, and four walls; with `windows`, one to three of them have windows."""
         rng, (x, y, z) = self.rng, self.size
         self.box([0, 0, -0.1], [x, y, 0], self.material())
-        self.box([0, 0, z], [x, y, z + 0.1], {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": float(rng.uniform(0.5, 0.9))}}})
+        self.ceiling({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": float(rng.uniform(0.5, 0.9))}}})
         wall, other = self.material(plain=True), self.material(plain=True)
         self.open_sides = rng.choice(4, rng.choice([1, 1, 2, 3]), replace=False).tolist() if windows else []
         for side in range(4):
@@ -53,6 +55,10 @@ class Room(Furnished):
                 self.box([0, -0.1, 0], [length, 0, z], bsdf, turned)
                 if rng.random() < 0.6:
                     self.pictures(length, z, turned)
+
+    def ceiling(self, bsdf: dict) -> None:
+        x, y, z = self.size
+        self.box([0, 0, z], [x, y, z + 0.1], bsdf)
 
     def windows(self, length: float, height: float, wall: dict, place) -> None:
         """A wall with windows: the wall around them, and blinds, bars, or curtains."""
@@ -95,7 +101,7 @@ class Room(Furnished):
         for _ in range(rng.integers(1, 4)):
             w, h = rng.uniform(0.3, 1.2), rng.uniform(0.3, 0.9)
             x, z = rng.uniform(0.2, max(0.3, length - w - 0.2)), rng.uniform(0.9, max(1.0, height - h - 0.3))
-            image = mosaic(rng, [self.tint() for _ in range(5)])
+            image = self.picture(rng, [self.tint() for _ in range(5)])
             canvas = {"type": "bitmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "raw": True}
             self.box([x - 0.04, 0, z - 0.04], [x + w + 0.04, 0.03, z + h + 0.04], self.any_material(), place)
             self.box([x, 0.03, z], [x + w, 0.035, z + h], {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": canvas}}, place)
@@ -150,7 +156,7 @@ class Room(Furnished):
 
     def furnish(self) -> None:
         rng, (x, y, _) = self.rng, self.size
-        kinds = [self.table, self.table, self.chair, self.chair, self.shelf, self.sofa, self.heap, self.plant, self.rug, self.post]
+        pieces = self.pieces()
         rows = rng.random() < 0.3
         if rows:
             # A classroom or a restaurant: equal furniture in rows.
@@ -161,16 +167,23 @@ class Room(Furnished):
                 for py in np.arange(0.8, y - 0.6, pitch[1]):
                     self.rng = np.random.default_rng(seed)
                     place = mi.ScalarTransform4f().translate([float(px), float(py), 0]).rotate([0, 0, 1], angle)
-                    self.table(place, small=True)
-                    self.chair(place.translate([0, -0.5, 0]))
+                    self.desk(place)
                     self.targets.append(np.array([px, py, 0.6]))
             self.rng = kept
         for _ in range(rng.integers(3, 7) if rows else rng.integers(6, 16)):
             at = [float(rng.uniform(0.1, 0.9) * side) for side in (x, y)]
             angle = float(rng.choice([0, 90, 180, 270]) + rng.normal(0, 12))
             place = mi.ScalarTransform4f().translate([*at, 0]).rotate([0, 0, 1], angle)
-            kinds[rng.integers(len(kinds))](place)
+            pieces[rng.integers(len(pieces))](place)
             self.targets.append(np.array([*at, rng.uniform(0.2, 1.2)]))
+
+    def pieces(self) -> list:
+        return [self.table, self.table, self.chair, self.chair, self.shelf, self.sofa, self.heap, self.plant, self.rug, self.post]
+
+    def desk(self, place) -> None:
+        """What stands in rows."""
+        self.table(place, small=True)
+        self.chair(place.translate([0, -0.5, 0]))
 
     def post(self, place) -> None:
         r = self.rng.uniform(0.03, 0.3)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from patterns import TEXTURE_SIDE, Rng, color, grain, pattern
+from patterns import TEXTURE_SIDE, Rng, color, grain, pattern, sky
 from variant import mi
 
+RINGS, SEGMENTS = 40, 48
+"""Resolution of a surface of revolution."""
 METALS = ("Al", "Ag", "Au", "Cu", "Cr", "W")
 
 
@@ -26,6 +28,10 @@ class Stage:
     A share `grained` of colours and patterns has a grain. Grains use the separate generator
     `grains`, so everything else is the same without them.
     """
+
+    pattern = staticmethod(pattern)
+    grain = staticmethod(grain)
+    sky = staticmethod(sky)
 
     def __init__(self, rng: Rng, grained: float = 0.0, grains: Rng | None = None) -> None:
         self.rng, self.grained, self.grains = rng, grained, grains
@@ -49,10 +55,10 @@ class Stage:
             image = np.full((TEXTURE_SIDE, TEXTURE_SIDE, 3), tint)
             scale = float(np.exp(self.grains.uniform(np.log(0.5), np.log(3))))
         else:
-            image = pattern(self.rng, np.array(self.tint()), np.array(self.tint()))
+            image = self.pattern(self.rng, np.array(self.tint()), np.array(self.tint()))
             scale = float(np.exp(self.rng.uniform(np.log(0.7), np.log(6))))
         if grained:
-            image = np.clip(image * grain(self.grains), 0.005, 0.95)
+            image = np.clip(image * self.grain(self.grains), 0.005, 0.95)
         return tiled(image, scale)
 
     def material(self, plain: bool = False) -> dict:
@@ -93,3 +99,31 @@ class Stage:
     def ball(self, center, radius: float, bsdf: dict, place: mi.ScalarTransform4f | None = None) -> None:
         shape = {"type": "sphere", "center": [float(v) for v in center], "radius": float(radius)}
         self.add(shape | {"to_world": place or mi.ScalarTransform4f()}, bsdf)
+
+    def turned(self, radius: np.ndarray, z: np.ndarray, place) -> None:
+        """The surface of revolution of a profile around z."""
+        angle = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
+        points = np.stack(
+            [
+                np.outer(radius, np.cos(angle)),
+                np.outer(radius, np.sin(angle)),
+                np.outer(z, np.ones_like(angle)),
+            ],
+            axis=-1,
+        )
+        v, u = np.meshgrid(np.linspace(0, 1, len(z)), np.linspace(0, 2, SEGMENTS + 1), indexing="ij")
+        row, column = np.meshgrid(np.arange(len(z) - 1), np.arange(SEGMENTS), indexing="ij")
+        a = (row * (SEGMENTS + 1) + column).ravel()
+        b, c, d = a + 1, a + SEGMENTS + 1, a + SEGMENTS + 2
+        faces = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)])
+        properties = mi.Properties()
+        properties["bsdf"] = mi.load_dict(self.any_material())
+        mesh = mi.Mesh("turned", points[..., 0].size, len(faces), has_vertex_texcoords=True, props=properties)
+        parameters = mi.traverse(mesh)
+        matrix = np.array(place.matrix, float)
+        world = points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
+        parameters["vertex_positions"] = mi.Float(world.ravel().astype(np.float32))
+        parameters["vertex_texcoords"] = mi.Float(np.stack([u, v], -1).ravel().astype(np.float32))
+        parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
+        parameters.update()
+        self.scene[f"shape{len(self.scene)}"] = mesh

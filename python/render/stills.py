@@ -7,16 +7,15 @@ from __future__ import annotations
 
 import numpy as np
 from furniture import Furnished
-from patterns import Rng, grain, pattern, sky, studio
-from stage import square_film, tiled
+from patterns import Rng, studio
+from stage import RINGS, square_film, tiled
 from variant import mi
-
-RINGS, SEGMENTS = 40, 48
-"""Resolution of a surface of revolution."""
 
 
 class Still(Furnished):
     """One still life."""
+
+    studio = staticmethod(studio)
 
     def __init__(self, rng: Rng, grained: float = 0.0, grains: Rng | None = None) -> None:
         super().__init__(rng, grained, grains)
@@ -25,12 +24,12 @@ class Still(Furnished):
         """Largest distance of a thing from the origin."""
         self.walled = rng.random() < (0.2 if self.square else 0.4)
         self.ground()
-        self.scene["sky"] = sky(rng, 1.0, skyline=rng.random() < 0.6)
+        self.scene["sky"] = self.sky(rng, 1.0, skyline=rng.random() < 0.6)
         self.arrange()
 
     def darken(self, rng: Rng) -> None:
         """Replaces the sky by lamps in a black studio."""
-        self.scene["sky"] = studio(rng)
+        self.scene["sky"] = self.studio(rng)
 
     def surface(self, side: float) -> dict:
         """A material for `side` metres of floor.
@@ -38,9 +37,9 @@ class Still(Furnished):
         Texels of its pattern measure millimetres on a table and centimetres on a square.
         """
         rng = self.rng
-        image = pattern(rng, np.array(self.tint()), np.array(self.tint()))
+        image = self.pattern(rng, np.array(self.tint()), np.array(self.tint()))
         if rng.random() < 0.75:
-            image = np.clip(image * grain(rng), 0.005, 0.95)
+            image = np.clip(image * self.grain(rng), 0.005, 0.95)
         tile = self.reach * np.exp(rng.uniform(np.log(0.4), np.log(3)))
         paint = tiled(image, float(side / tile))
         if rng.random() < 0.6:
@@ -62,7 +61,7 @@ class Still(Furnished):
 
     def arrange(self) -> None:
         rng = self.rng
-        pieces = [self.chair, self.table, self.sofa, self.heap, self.plant, self.shelf, self.bollard, self.bollard, self.vase]
+        pieces = self.pieces()
         for _ in range(rng.integers(4, 16)):
             angle, out = rng.uniform(0, 2 * np.pi), self.reach * np.sqrt(rng.random())
             place = mi.ScalarTransform4f().translate([float(out * np.cos(angle)), float(out * np.sin(angle)), 0])
@@ -79,6 +78,10 @@ class Still(Furnished):
                     self.thing(place)
                 else:
                     pieces[rng.integers(4)](place.scale([small] * 3))
+
+    def pieces(self) -> list:
+        """Things on a square. The first four also stand on tables, toy-sized."""
+        return [self.chair, self.table, self.sofa, self.heap, self.plant, self.shelf, self.bollard, self.bollard, self.vase]
 
     def bollard(self, place) -> None:
         rng = self.rng
@@ -101,34 +104,6 @@ class Still(Furnished):
         z = height * t
         radius, z = np.concatenate([[0], radius, [0]]), np.concatenate([[0], z, [height]])
         self.turned(radius, z, place)
-
-    def turned(self, radius: np.ndarray, z: np.ndarray, place) -> None:
-        """The surface of revolution of a profile around z."""
-        angle = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
-        points = np.stack(
-            [
-                np.outer(radius, np.cos(angle)),
-                np.outer(radius, np.sin(angle)),
-                np.outer(z, np.ones_like(angle)),
-            ],
-            axis=-1,
-        )
-        v, u = np.meshgrid(np.linspace(0, 1, len(z)), np.linspace(0, 2, SEGMENTS + 1), indexing="ij")
-        row, column = np.meshgrid(np.arange(len(z) - 1), np.arange(SEGMENTS), indexing="ij")
-        a = (row * (SEGMENTS + 1) + column).ravel()
-        b, c, d = a + 1, a + SEGMENTS + 1, a + SEGMENTS + 2
-        faces = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)])
-        properties = mi.Properties()
-        properties["bsdf"] = mi.load_dict(self.any_material())
-        mesh = mi.Mesh("turned", points[..., 0].size, len(faces), has_vertex_texcoords=True, props=properties)
-        parameters = mi.traverse(mesh)
-        matrix = np.array(place.matrix, float)
-        world = points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
-        parameters["vertex_positions"] = mi.Float(world.ravel().astype(np.float32))
-        parameters["vertex_texcoords"] = mi.Float(np.stack([u, v], -1).ravel().astype(np.float32))
-        parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
-        parameters.update()
-        self.scene[f"shape{len(self.scene)}"] = mesh
 
     def camera(self, rng: Rng, side: int) -> dict:
         """A view from above; two of three have a thin lens."""

@@ -31,11 +31,21 @@ class Samples:
     features: dict[str, np.ndarray]
     count: int
 
+    def plus(self, other: Samples | None) -> Samples:
+        """The sums over the samples of both."""
+        if other is None:
+            return self
+        features = {name: planes + other.features[name] for name, planes in self.features.items()}
+        return Samples(self.color + other.color, features, self.count + other.count)
 
-def render(scene: mi.Scene, samples: int, seed: int, clamp: float = np.inf, view: int = 0) -> Samples:
+
+def render(
+    scene: mi.Scene, samples: int, seed: int, clamp: float = np.inf, view: int = 0, follow: bool = False
+) -> Samples:
     """Traces `samples` paths per pixel of sensor number `view`: box filter, independent sampler.
 
-    `clamp` limits the radiance of a sample, without emitters seen directly.
+    `clamp` limits the radiance of a sample, without emitters seen directly. With `follow`, albedo is that of
+    the first surface behind mirrors and clear glass, as Blender Cycles and LuxCore write it.
     """
     sensor = scene.sensors()[view]
     width, height = (int(side) for side in sensor.film().crop_size())
@@ -43,14 +53,16 @@ def render(scene: mi.Scene, samples: int, seed: int, clamp: float = np.inf, view
     sums, done = None, 0
     while done < samples:
         count = min(at_once, samples - done)
-        traced = trace_pixels(scene, sensor, width, height, count, seed + done, clamp)
+        traced = trace_pixels(scene, sensor, width, height, count, seed + done, clamp, follow)
         sums = traced if sums is None else {name: sums[name] + traced[name] for name in sums}
         done += count
     shaped = {name: plane.reshape(height, width, -1) for name, plane in sums.items()}
     return Samples(shaped.pop("color"), shaped, samples)
 
 
-def trace_pixels(scene, sensor, width: int, height: int, count: int, seed: int, clamp: float) -> dict[str, np.ndarray]:
+def trace_pixels(
+    scene, sensor, width: int, height: int, count: int, seed: int, clamp: float, follow: bool
+) -> dict[str, np.ndarray]:
     """Sums over `count` paths of each pixel, `[H * W, C]` float64."""
     paths = width * height * count
     sampler = mi.load_dict({"type": "independent"})
@@ -61,7 +73,7 @@ def trace_pixels(scene, sensor, width: int, height: int, count: int, seed: int, 
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
     film = (corner + sampler.next_2d()) / mi.ScalarPoint2f(width, height)
     ray, weight = sensor.sample_ray(0.0, sampler.next_1d(), film, sampler.next_2d())
-    color, features = trace(scene, sampler, ray, dr.opaque(mi.Float, min(clamp, 1e30)))
+    color, features = trace(scene, sampler, ray, dr.opaque(mi.Float, min(clamp, 1e30)), dr.opaque(mi.Bool, follow))
     color = color * weight
 
     channels = {"color": [*color]}
@@ -75,14 +87,18 @@ def trace_pixels(scene, sensor, width: int, height: int, count: int, seed: int, 
 
 
 @dr.syntax
-def trace(scene, sampler, ray, clamp):
-    """Radiance and features of each ray: `(Color3f, (normal, position, albedo1, albedo2, mask))`."""
+def trace(scene, sampler, ray, clamp, follow):
+    """Radiance and features of each ray: `(Color3f, (normal, position, albedo1, albedo2, mask))`.
+
+    `follow` (`Bool`): mirrors and clear glass tint the albedo of what is behind them.
+    """
     context = mi.BSDFContext()
     ray = mi.Ray3f(ray)
     radiance, seen, throughput = mi.Color3f(0), mi.Color3f(0), mi.Color3f(1)
     normal, position, albedo1, albedo2 = mi.Vector3f(0), mi.Vector3f(0), mi.Color3f(0), mi.Color3f(0)
     mask = mi.Float(0)
     depth, active = mi.UInt32(0), mi.Bool(True)
+    surfaces = mi.UInt32(0)  # Vertices that have given an albedo.
     before = dr.zeros(mi.SurfaceInteraction3f)
     before_pdf, before_delta, eta = mi.Float(1), mi.Bool(True), mi.Float(1)
 
@@ -114,17 +130,22 @@ def trace(scene, sampler, ray, clamp):
         light_mis = dr.select(light.delta, 1, power(light.pdf, pdf))
         radiance = dr.select(smooth, radiance + throughput * si.to_world_mueller(value, -towards, si.wi) * light_weight * light_mis, radiance)
 
-        # Features of the first two vertices.
-        if active & (depth < 2):
+        # Normal, position, and mask of the first vertex, albedo of two.
+        if active & (depth == 0) & si.is_valid():
+            normal = mi.Vector3f(dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n))
+            position = mi.Vector3f(si.p)
+            mask = mi.Float(1)
+        clear = follow & (surfaces == 0) & si.is_valid() & mi.has_flag(flags, mi.BSDFFlags.Delta)
+        clear &= ~mi.has_flag(flags, mi.BSDFFlags.Smooth) & going_on
+        if active & (surfaces < 2) & ~clear:
+            first = surfaces == 0
             texture = albedo(bsdf, si, sample_weight, emitter, active)
-            first = depth == 0
-            hit = first & si.is_valid()
-            facing = dr.select(dr.dot(si.sh_frame.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
-            normal = dr.select(hit, facing, normal)
-            position = dr.select(hit, si.p, position)
-            mask = dr.select(hit, 1, mask)
+            # Behind a mirror, a lamp may be brighter than any surface.
+            behind = follow & first & (depth > 0)
+            texture = dr.select(behind, throughput * texture, dr.minimum(1, texture))
             albedo1 = dr.select(first, texture, albedo1)
             albedo2 = dr.select(first, albedo2, texture)
+            surfaces += 1
 
         # The next direction.
         ray = si.spawn_ray(si.to_world(sample.wo))
@@ -154,9 +175,8 @@ def power(a: mi.Float, b: mi.Float) -> mi.Float:
 
 
 def albedo(bsdf, si, sample_weight, emitter, active):
-    """Diffuse reflectance, or else the specular tint; emission, at most 1, for emitters and sky."""
+    """Diffuse reflectance, or else the specular tint; emission of emitters and sky."""
     diffuse = bsdf.eval_diffuse_reflectance(si, active)
     tint = dr.clip(sample_weight, 0, 1)
     surface = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse), diffuse, tint)
-    surface = dr.select(si.is_valid(), surface, 0)
-    return dr.minimum(1, surface + emitter.eval(si, active))
+    return dr.select(si.is_valid(), surface, 0) + emitter.eval(si, active)

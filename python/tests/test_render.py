@@ -15,6 +15,13 @@ from pathlib import Path
 FOLDER = Path(__file__).resolve().parents[1] / "render"
 MISSING = [name for name in ("numpy", "OpenEXR", "mitsuba") if importlib.util.find_spec(name) is None]
 SIDE, SAMPLES = 32, 1024
+SHARED = {
+    *("Stage.__init__", "Stage.tint", "Stage.paint", "Stage.material", "Stage.any_material", "color", "noise", "tiled"),
+    *("Stage.add", "Stage.box", "Stage.rod", "Stage.ball", "Stage.turned", "environment", "square_film"),
+    *("Room.__init__", "Room.shell", "Room.ceiling", "Room.pictures", "Room.furnish", "Room.blacken", "Room.camera"),
+    *("Still.__init__", "Still.ground", "Still.surface", "Still.arrange", "Still.darken", "Still.camera"),
+}
+"""What draws training scenes and the scenes of the held-out set."""
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess:
@@ -155,6 +162,7 @@ class Render(unittest.TestCase):
     def test_a_turned_surface_is_closed_and_faces_outwards(self) -> None:
         import mitsuba as mi
         import numpy as np
+        import stage
         import stills
 
         still = stills.Still(np.random.default_rng(1))
@@ -168,7 +176,7 @@ class Render(unittest.TestCase):
         a, b, c = points[np.array(parameters["faces"]).reshape(-1, 3).T].astype(float) - [1, 2, 0]
         # By the divergence theorem; glass needs to know which side is in.
         volume = np.einsum("ij,ij", a, np.cross(b, c)) / 6
-        polygon = stills.SEGMENTS / 2 * 0.1**2 * np.sin(2 * np.pi / stills.SEGMENTS)
+        polygon = stage.SEGMENTS / 2 * 0.1**2 * np.sin(2 * np.pi / stage.SEGMENTS)
         self.assertAlmostEqual(volume, polygon * 0.3, places=6)
 
     def test_a_lens_blurs_what_is_out_of_its_focus(self) -> None:
@@ -241,6 +249,21 @@ class Render(unittest.TestCase):
             both = json.loads((first / "manifest.json").read_text())["scenes"]
             self.assertEqual([scene["file"] for scene in both[len(scenes) :]], [f"../second/{scene['file']}" for scene in scenes])
 
+    def test_shards_make_the_data_set_of_one_run(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            # Of these views, one is left out.
+            ask = ("--rooms", 3, "--views", 1, "--seed", 29, "--size", 32, "--ref-spp", 32)
+            whole, shared = Path(folder) / "whole", Path(folder) / "shared"
+            self.assertEqual(run("-o", whole, *ask).returncode, 0)
+            workers = [subprocess.Popen([sys.executable, FOLDER, *map(str, ("-o", shared, *ask, "--shard", part))]) for part in ("1/3", "2/3", "3/3", "3/3")]
+            self.assertEqual([worker.wait() for worker in workers], [0] * 4)
+            self.assertFalse((shared / "manifest.json").exists())
+            ended = run("-o", shared, *ask)
+            self.assertEqual((ended.returncode, ended.stdout), (0, ""), ended.stderr)
+            files = lambda out: {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+            self.assertEqual(files(whole), files(shared))
+            self.assertTrue(json.loads((whole / "manifest.json").read_text())["left_out"])
+
     def test_a_reference_keeps_features_of_its_own_samples(self) -> None:
         import numpy as np
         import OpenEXR
@@ -259,6 +282,120 @@ class Render(unittest.TestCase):
                     self.assertLess(abs(few.mean() - many.mean()), 0.02, name)
                     step = lambda plane: np.abs(plane[:, :-2] - 2 * plane[:, 1:-1] + plane[:, 2:]).mean()
                     self.assertLess(step(many), step(few), name)
+
+    def test_albedo_is_that_of_what_a_mirror_shows(self) -> None:
+        import numpy as np
+        import tracer
+        from variant import mi
+
+        scene = self.scene()
+        scene["ball"]["bsdf"] = {"type": "conductor", "material": "none"}
+        scene = mi.load_dict(scene)
+        plain, behind = (tracer.render(scene, 64, 1000, follow=follow).features for follow in (False, True))
+        for name in ("normal", "position", "mask"):
+            np.testing.assert_array_equal(plain[name], behind[name])
+        ball = np.s_[22:25, 20:23]
+        np.testing.assert_allclose(plain["albedo1"][ball] / 64, 1, atol=0.01)
+        # It shows the box: its albedo is the second one of the plain image.
+        np.testing.assert_allclose(behind["albedo1"][ball] / 64, plain["albedo2"][ball] / 64, atol=0.02)
+        wall = np.s_[8:16, 1:4]
+        np.testing.assert_array_equal(plain["albedo1"][wall], behind["albedo1"][wall])
+
+    def test_an_image_of_more_samples_contains_those_of_fewer(self) -> None:
+        import numpy as np
+        import OpenEXR
+
+        def planes(path: Path, prefix: str) -> np.ndarray:
+            with OpenEXR.File(str(path), separate_channels=True) as file:
+                return np.stack([file.channels()[prefix + name].pixels.astype(float) for name in "RGB"])
+
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder)
+            ask = ("--stills", 1, "--views", 1, "--size", 32, "--ref-spp", 64)
+            ended = run("-o", out, *ask, "--spp", "16,1")
+            self.assertEqual(ended.returncode, 0, ended.stderr)
+            few, many = json.loads((out / "manifest.json").read_text())["scenes"]
+            few, many = sorted((few, many), key=lambda scene: scene["spp"])
+            self.assertEqual((few["spp"], many["spp"], few["base"]), (1, 16, many["base"]))
+            self.assertEqual([scene["name"][-5:] for scene in (few, many)], ["-1spp", "16spp"])
+            self.assertLess(many["noisy_relmse"], few["noisy_relmse"])
+            self.assertGreaterEqual(many["ref_spp"], 64)
+            np.testing.assert_array_equal(planes(out / few["file"], "ref."), planes(out / many["file"], "ref."))
+            difference = planes(out / few["file"], "") - planes(out / many["file"], "")
+            noise = planes(out / few["file"], "") - planes(out / few["file"], "ref.")
+            self.assertLess((difference**2).mean(), (noise**2).mean())
+
+    def test_each_view_has_its_own_count_and_traits(self) -> None:
+        import numpy as np
+        import views
+
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder)
+            ask = ("--preset", "train", "--rooms", 0, "--stills", 4, "--views", 1, "--size", 32, "--ref-spp", 32, "--spp", "1,2,4", "--traits", 1)
+            ended = run("-o", out, *ask)
+            self.assertEqual(ended.returncode, 0, ended.stderr)
+            scenes = json.loads((out / "manifest.json").read_text())["scenes"]
+            self.assertEqual(len({scene["base"] for scene in scenes}), len(scenes))
+            self.assertGreater(len({scene["spp"] for scene in scenes}), 1)
+            for scene in scenes:
+                self.assertTrue(0.35 <= scene["pixel_filter_sigma"] <= 0.75 and scene["albedo_behind_glass"])
+        # The noise of neighbouring pixels is correlated, and the mean stays.
+        noise = np.random.default_rng(1).standard_normal((64, 64, 3))
+        wide = views.filtered(noise, 0.5)
+        self.assertGreater(np.corrcoef(wide[:, 1:].ravel(), wide[:, :-1].ravel())[0, 1], 0.15)
+        np.testing.assert_allclose(views.filtered(np.full((8, 8, 3), 0.7), 0.75), 0.7)
+        np.testing.assert_array_equal(views.filtered(noise, 0.0), noise)
+
+    def test_training_and_held_out_scenes_draw_different_things(self) -> None:
+        import numpy as np
+        import reserved
+        from rooms import Room
+        from stills import Still
+
+        def called(room_class: type, still_class: type) -> set[str]:
+            """The functions that draw 15 rooms and still lifes."""
+            names: set[str] = set()
+
+            def note(frame, event: str, _) -> None:
+                if event == "call" and Path(frame.f_code.co_filename).parent == FOLDER:
+                    names.add(frame.f_code.co_qualname.partition(".<locals>")[0])
+
+            sys.setprofile(note)
+            try:
+                for index in range(15):
+                    rng, grains = (np.random.default_rng([5, index, stream]) for stream in range(2))
+                    room = room_class(rng, 0.6, grains)
+                    room.sun(rng)
+                    room.blacken(rng)
+                    room.camera(rng, SIDE)
+                    still = still_class(rng, 0.6, grains)
+                    still.darken(rng)
+                    still.camera(rng, SIDE)
+            finally:
+                sys.setprofile(None)
+            return names
+
+        training = called(Room, Still)
+        held_out = called(reserved.ReservedRoom, reserved.ReservedStill)
+        self.assertEqual(training & held_out, SHARED)
+        own = [value for value in vars(reserved).values() if getattr(value, "__module__", "") == "reserved"]
+        functions = {function.__qualname__ for function in own if not isinstance(function, type)}
+        functions |= {f"{kind.__name__}.{name}" for kind in own if isinstance(kind, type) for name, value in vars(kind).items() if callable(value) and not isinstance(value, staticmethod)}
+        self.assertEqual(functions - held_out, set())
+
+    def test_a_shard_outside_1_to_n_is_an_error(self) -> None:
+        for part in ("0/4", "5/4", "x"):
+            with tempfile.TemporaryDirectory() as empty:
+                ended = run("-o", empty, "--rooms", 1, "--shard", part)
+            self.assertEqual(ended.returncode, 2)
+            self.assertIn("expected I/N with I from 1 to N, such as 1/4", ended.stderr)
+
+    def test_wrong_counts_are_an_error(self) -> None:
+        for counts in ("0", "1,x", "", "-4"):
+            with tempfile.TemporaryDirectory() as empty:
+                ended = run("-o", empty, "--rooms", 1, f"--spp={counts}")
+            self.assertEqual(ended.returncode, 2)
+            self.assertIn("argument --spp", ended.stderr)
 
     def test_nothing_to_render_is_an_error(self) -> None:
         with tempfile.TemporaryDirectory() as empty:
