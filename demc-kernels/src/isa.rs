@@ -97,6 +97,15 @@ impl Isa {
         }
     }
 
+    /// The path for products of this number of channels: 8 or fewer leave half of a 512-bit vector
+    /// empty.
+    pub(crate) fn for_channels(self, channels: usize) -> Isa {
+        match (self, channels) {
+            (Isa::Avx512, ..=8) => Isa::Avx2,
+            _ => self,
+        }
+    }
+
     /// The path named by the variable [`VARIABLE`], if it is set.
     ///
     /// # Errors

@@ -29,6 +29,7 @@ pub fn forward(
         check(grid, xs, weight.len(), bias.len(), y.len()),
         bias.len(),
     );
+    let isa = isa.for_channels(outputs);
     let total: usize = inputs.iter().map(|(_, count)| count).sum();
     let weights: Vec<Packed> = inputs
         .iter()
@@ -83,6 +84,7 @@ pub fn part(
     y: &mut [f32],
 ) {
     let outputs = grid.channels(y.len());
+    let isa = isa.for_channels(outputs);
     let total = weight.len() / outputs;
     let inputs = widths(grid, xs);
     let end = first + inputs.iter().map(|(_, count)| count).sum::<usize>();

@@ -98,13 +98,14 @@ impl<'a> PreparedConvolution<'a> {
             outputs * inputs * 9,
             "a weight of {inputs} to {outputs} channels"
         );
+        let wide = isa.for_channels(inputs.max(outputs));
         let weights = match tile {
             _ if !is_wide(inputs, outputs) => PreparedWeights::Thin(weight),
             Tile::F2 => PreparedWeights::F2(winograd::WinogradWeights::new::<4>(
-                isa, weight, outputs, inputs, false,
+                wide, weight, outputs, inputs, false,
             )),
             Tile::F4 => PreparedWeights::F4(winograd::WinogradWeights::new::<6>(
-                isa, weight, outputs, inputs, false,
+                wide, weight, outputs, inputs, false,
             )),
         };
         let epilogue = BiasRelu {

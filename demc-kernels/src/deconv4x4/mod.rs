@@ -70,6 +70,7 @@ impl<'a> PreparedDeconvolution<'a> {
             inputs * outputs * 16,
             "a weight of {inputs} to {outputs} channels"
         );
+        let isa = isa.for_channels(outputs);
         let weights = packed(isa, weight, inputs, outputs, false);
         PreparedDeconvolution {
             isa,

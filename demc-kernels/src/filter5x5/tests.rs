@@ -29,6 +29,33 @@ fn it_is_the_plain_sum_on_every_path() {
     }
 }
 
+/// Two batches of three images each, on every path: the bits of each image alone.
+#[test]
+fn images_that_share_kernels_are_filtered_as_each_alone() {
+    for grid in few(grids(), 2) {
+        let (pixels, sharing) = (grid.height * grid.width, 3);
+        let x = pattern(sharing * grid.pixels() * COLORS, 1);
+        for channels in [TAPS, TAPS + 1] {
+            let (logits, outputs) = (logits(grid, channels), COLORS + channels - TAPS);
+            for isa in Isa::available() {
+                let mut y = vec![f32::NAN; sharing * grid.pixels() * outputs];
+                forward(isa, grid, &x, &logits, &mut y);
+                let mut alone = y.clone();
+                let single = Grid { batch: 1, ..grid };
+                let images = x.chunks(pixels * COLORS);
+                let targets = alone.chunks_mut(pixels * outputs);
+                for (image, (x, alone)) in images.zip(targets).enumerate() {
+                    alone.fill(f32::NAN);
+                    let first = image / sharing * pixels * channels;
+                    let logits = &logits[first..first + pixels * channels];
+                    forward(isa, single, x, logits, alone);
+                }
+                assert_eq!(bits(&y), bits(&alone), "{isa} {grid:?} {channels}");
+            }
+        }
+    }
+}
+
 /// Central differences of the float64 loops.
 #[test]
 fn the_gradient_is_that_of_differences() {
@@ -81,11 +108,11 @@ fn bits_depend_neither_on_the_path_nor_on_the_threads_nor_on_bands() {
     let rows = 7 * grid.width..27 * grid.width;
     forward_rows(
         Isa::current(),
-        grid,
+        Grid { batch: 1, ..grid },
         &x[..image * COLORS],
         7..27,
         &logits[rows.start * (TAPS + 1)..rows.end * (TAPS + 1)],
-        &mut band,
+        vec![&mut band],
     );
     assert_eq!(bits(&band), bits(&whole[rows.start * 4..rows.end * 4]));
 }
