@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context, ensure};
 use burn::tensor::Device;
-use demc_data::{Batch, ChannelLayout, FEATURES, FeatureStats, Normalizer, PositionSpace};
+use demc_data::{Batch, ChannelLayout, FEATURES, FeatureStats, Normalizer, Patch, PositionSpace};
 use demc_infer::{Bundle, BundleMeta, Names, Precision};
 use demc_model::{ModelConfig, Reading, Role, Variant, WeightSpec, Weights};
 use rand::{RngExt, SeedableRng};
@@ -56,6 +56,7 @@ pub fn network(width: usize) -> Bundle {
         albedo_demodulation_epsilon: None,
         position: PositionSpace::Scene,
         exposure_level: None,
+        restore_light: false,
         features: FeatureStats {
             mean: [0.0; FEATURES],
             std: [1.0; FEATURES],
@@ -98,13 +99,23 @@ pub fn input(batch: usize, height: usize, width: usize) -> CaseInput {
         features_z: draw(FEATURES, -1.7, 1.7),
         modulation: None,
         reference_hdr: draw(3, 0.2, 2.0),
-        patches: Vec::new(),
+        patches: patches(batch),
     };
     CaseInput {
         batch,
         height,
         width,
     }
+}
+
+/// The places that a batch of noise claims to be from.
+fn patches(count: usize) -> Vec<Patch> {
+    let place = Patch {
+        scene: 0,
+        y: 0,
+        x: 0,
+    };
+    vec![place; count]
 }
 
 /// Writes the files that all contenders read, with PyTorch's names.
@@ -186,7 +197,7 @@ pub fn read_input(path: &Path) -> anyhow::Result<CaseInput> {
             features_z: values("features_z")?,
             modulation: None,
             reference_hdr: values("reference_hdr")?,
-            patches: Vec::new(),
+            patches: patches(shape[0]),
         },
         height: shape[2],
         width: shape[3],

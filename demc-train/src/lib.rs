@@ -6,11 +6,13 @@
 //!   needs.
 //! - [`step`] is one optimizer step: [`step::trainer`] computes loss and gradient (Eq. 5),
 //!   [`step::optimizer`] updates the weights.
+//! - [`ranks`] joins the processes that train one run, with the feature `mpi`.
 //! - [`record`] writes metrics, TensorBoard events and the progress bar.
 //! - [`tools`] compares variants, finds learning rates and draws charts.
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod config;
+pub mod ranks;
 pub mod record;
 pub mod run;
 pub mod step;

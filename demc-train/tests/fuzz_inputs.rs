@@ -1,9 +1,11 @@
-//! The findings of `fuzz/` in configurations: each one caused a failure.
+//! The inputs of `fuzz/`: findings in configurations, each of which caused a failure, and valid logs.
 
 use std::fs;
 use std::path::Path;
 
 use demc_train::Config;
+use demc_train::record::metrics_log::read_lines;
+use serde_json::Value;
 
 #[test]
 fn every_finding_is_valid_or_gives_a_one_line_error() {
@@ -25,5 +27,17 @@ fn every_finding_is_valid_or_gives_a_one_line_error() {
             }
             Err(error) => assert!(!error.to_string().contains('\n'), "{error}"),
         }
+    }
+}
+
+#[test]
+fn every_line_of_a_seed_of_a_log_is_intact() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/seeds/metrics");
+    for file in fs::read_dir(folder).expect("it is in the repository") {
+        let path = file.expect("readable").path();
+        let bytes = fs::read(&path).expect("readable");
+        let found = read_lines::<Value>(&bytes);
+        assert!(found.damaged.is_empty(), "{}", path.display());
+        assert!(!found.lines.is_empty(), "{}", path.display());
     }
 }

@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 use demc_train::config::utf8;
+use demc_train::ranks::Ranks;
 use demc_train::record::progress::say;
 use demc_train::tools::ablation::spec::AblationSpec;
 use demc_train::tools::ablation::{self, AblationOutcome};
@@ -35,12 +36,13 @@ pub struct Arguments {
 }
 
 /// Trains and compares the variants.
-pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
-    let mut spec = AblationSpec::load(&arguments.config, &arguments.set)?;
+pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<ExitCode> {
+    let spec = AblationSpec::load(&arguments.config, &arguments.set);
+    let mut spec = ranks.agree(spec.map_err(Into::into))?;
     if let Some(dir) = arguments.run_dir {
         spec.dir = utf8("--run-dir", &dir)?.into();
     }
-    let device = arguments.compute.device()?;
+    let place = arguments.compute.place(ranks)?;
     for variant in &spec.variants {
         let model = &variant.config.model;
         say(format!(
@@ -53,11 +55,12 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     for difference in spec.differences() {
         say(format!("note: not only the network differs: {difference}"));
     }
-    match ablation::run(&spec, &device, &arguments.compute.device)? {
+    match ablation::run(&spec, &place)? {
         AblationOutcome::Stopped { signal, step } => {
             Ok(stopped(signal, step, "rerun the command to resume"))
         }
-        AblationOutcome::Done(comparison) => {
+        AblationOutcome::Done(None) => Ok(ExitCode::SUCCESS),
+        AblationOutcome::Done(Some(comparison)) => {
             let paths = ablation::write(&comparison, &spec.dir)?;
             say(format!("\n{}", ablation::markdown(&comparison)));
             for path in paths {

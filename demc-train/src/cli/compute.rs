@@ -6,7 +6,9 @@ use burn::tensor::Device;
 use clap::Args;
 use demc_infer::compute::ComputeFlags;
 use demc_infer::device;
+use demc_train::ranks::{OnNode, Ranks};
 use demc_train::record::progress::say;
+use demc_train::run::session::SessionPlace;
 use demc_train::run::signals;
 
 /// Device and implementation of the computation.
@@ -21,10 +23,28 @@ pub(super) struct ComputeArguments {
 }
 
 impl ComputeArguments {
-    /// The device, without autodiff. Sets implementation and instruction set for the process.
-    pub(super) fn device(&self) -> anyhow::Result<Device> {
-        self.flags.apply()?;
-        Ok(device::parse(&self.device)?)
+    /// The device of this rank, without autodiff. Sets implementation and instruction set for the
+    /// process.
+    pub(super) fn place(&self, ranks: &Ranks) -> anyhow::Result<SessionPlace> {
+        let name = device_of_rank(&self.device, ranks.on_node());
+        let device = || -> anyhow::Result<Device> {
+            self.flags.apply()?;
+            Ok(device::parse(&name)?)
+        };
+        Ok(SessionPlace {
+            device: ranks.agree(device())?,
+            device_name: name,
+            ranks: ranks.clone(),
+        })
+    }
+}
+
+/// The device of a rank: if several ranks of a node share the name of a GPU backend, each gets the
+/// GPU of its number.
+fn device_of_rank(name: &str, on_node: OnNode) -> String {
+    match name {
+        "wgpu" | "cuda" if on_node.count > 1 => format!("{name}:{}", on_node.rank),
+        name => name.to_owned(),
     }
 }
 
@@ -35,4 +55,19 @@ pub(super) fn stopped(signal: i32, step: u64, how: &str) -> ExitCode {
         signals::name(signal)
     ));
     ExitCode::from(u8::try_from(signals::exit_code(signal)).unwrap_or(1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_rank_of_a_node_has_its_own_gpu() {
+        let second = OnNode { rank: 1, count: 4 };
+        assert_eq!(device_of_rank("wgpu", second), "wgpu:1");
+        assert_eq!(device_of_rank("cuda:3", second), "cuda:3");
+        assert_eq!(device_of_rank("flex", second), "flex");
+        let alone = OnNode { rank: 0, count: 1 };
+        assert_eq!(device_of_rank("wgpu", alone), "wgpu");
+    }
 }

@@ -7,6 +7,7 @@ use clap::Args;
 use demc_data::message::{UsageError, printable};
 use demc_data::output::{Directories, Outputs};
 use demc_train::config::Config;
+use demc_train::ranks::{self, Ranks};
 use demc_train::record::progress::{StepProgress, say};
 use demc_train::run::data::{RunData, protect_inputs};
 use demc_train::tools::chart::with_extension;
@@ -54,7 +55,7 @@ pub struct Arguments {
 }
 
 /// Runs the sweep and prints its suggestion.
-pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
+pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<ExitCode> {
     let Arguments {
         from, to, steps, ..
     } = arguments;
@@ -74,20 +75,27 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         ))
         .into());
     }
-    let config = Config::load(&arguments.config, &arguments.set)?;
+    let config = Config::load(&arguments.config, &arguments.set);
+    let config = ranks.agree(config.map_err(Into::into))?;
     let name = arguments.config.file_stem().unwrap_or_default();
     let stem = arguments
         .out
         .unwrap_or_else(|| Path::new("runs/find-lr").join(name));
-    let mut outputs = Outputs::default();
-    let file = std::slice::from_ref(&arguments.config);
-    protect_inputs(&mut outputs, file, &config)?;
-    for extension in ["csv", "svg"] {
-        outputs.claim(&with_extension(&stem, extension)?, true)?;
-    }
-    let device = arguments.compute.device()?;
-    outputs.prepare(Directories::Create)?;
-    let data = RunData::open(&config)?;
+    let place = arguments.compute.place(ranks)?;
+    ranks.agree(ranks::check_divides(
+        ranks.count(),
+        config.train.grad_accumulation,
+    ))?;
+    let data = ranks.from_first(|| {
+        let mut outputs = Outputs::default();
+        let file = std::slice::from_ref(&arguments.config);
+        protect_inputs(&mut outputs, file, &config)?;
+        for extension in ["csv", "svg"] {
+            outputs.claim(&with_extension(&stem, extension)?, true)?;
+        }
+        outputs.prepare(Directories::Create)?;
+        RunData::open(&config)
+    })?;
     for warning in &data.warnings {
         say(format!("warning: {}", printable(warning)));
     }
@@ -100,7 +108,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let progress = StepProgress::new(0, steps as u64, per_step, data.train.len());
     let mut done = 0;
     let range = RateRange { from, to, steps };
-    let found = sweep(&config, &data, range, &device, |point| {
+    let found = sweep(&config, &data, range, &place.device, ranks, |point| {
         done += 1;
         progress.step(done, point.loss);
     })?;
@@ -117,6 +125,9 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
             "suggestion: --set optimizer.lr_start={lr:e}, a tenth of the rate with the smallest loss"
         )),
         None => say("no suggestion: the loss never fell below that of the untrained network"),
+    }
+    if !ranks.is_first() {
+        return Ok(ExitCode::SUCCESS);
     }
     for path in found.write(&stem)? {
         say(path.display());

@@ -9,6 +9,7 @@ mod train;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use demc_train::ranks::Ranks;
 
 /// Train a DEMC Monte Carlo denoiser on rendered images.
 ///
@@ -50,10 +51,11 @@ Examples:
 
 /// Runs the program.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
+    let ranks = Ranks::world();
     match arguments.subcommand {
-        Some(SubcommandArguments::FindLr(arguments)) => find_lr::run(arguments),
-        Some(SubcommandArguments::Ablate(arguments)) => ablate::run(arguments),
+        Some(SubcommandArguments::FindLr(arguments)) => find_lr::run(arguments, &ranks),
+        Some(SubcommandArguments::Ablate(arguments)) => ablate::run(arguments, &ranks),
         Some(SubcommandArguments::Plot(arguments)) => plot::run(arguments),
-        None => train::run(arguments.train),
+        None => train::run(arguments.train, &ranks),
     }
 }

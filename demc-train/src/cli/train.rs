@@ -1,11 +1,13 @@
 //! Training: the default of `demc-train`.
 
+use std::num::NonZero;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
 use demc_data::message::printable;
 use demc_train::config::{Config, ConfigError, utf8};
+use demc_train::ranks::Ranks;
 use demc_train::record::progress::say;
 use demc_train::run::run_dir::{CONFIG, copy_in_checkpoint};
 use demc_train::run::session::{Session, SessionOptions, SessionOutcome};
@@ -40,6 +42,14 @@ pub struct Arguments {
     /// Check configuration and data and print the estimated duration; writes nothing
     #[arg(long)]
     check: bool,
+
+    /// With --check: also predict the time of a step on this many MPI ranks, one per node
+    #[arg(long, value_name = "N", requires = "check")]
+    ranks: Option<NonZero<u16>>,
+
+    /// With --ranks: bandwidth of the network between the nodes, in GB/s
+    #[arg(long, value_name = "GB/S", requires = "ranks", default_value_t = 1.25)]
+    bandwidth: f64,
 }
 
 /// A path in one line.
@@ -68,22 +78,26 @@ fn with_copy(error: ConfigError, config: &Path) -> ConfigError {
 }
 
 /// Trains a run, new or resumed.
-pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
+pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<ExitCode> {
     let mut sets = arguments.set;
     if let Some(dir) = &arguments.run_dir {
-        sets.push(run_dir_set(dir)?);
+        sets.push(ranks.agree(run_dir_set(dir).map_err(Into::into))?);
     }
     let file = arguments.config.expect("clap requires it");
-    let config = Config::load(&file, &sets).map_err(|error| with_copy(error, &file))?;
-    let device = arguments.compute.device()?;
+    let config = Config::load(&file, &sets).map_err(|error| with_copy(error, &file));
+    let config = ranks.agree(config.map_err(Into::into))?;
+    let place = arguments.compute.place(ranks)?;
     let options = SessionOptions {
         resume: arguments.resume,
         check: arguments.check,
     };
     let (root, dir) = (config.data.root.clone(), config.run_dir().to_path_buf());
-    let session = Session::open(config, options, &device, &arguments.compute.device)?;
+    let session = Session::open(config, options, &place)?;
     session.check_outputs(&[file])?;
     say(format!("demc-train: {}", session.headline()));
+    if let Some(placement) = &session.placement {
+        say(placement);
+    }
     say(format!("\n{}", session.run().config().to_toml()));
     say(format!("data: {} in {}", session.data, shown(&root)));
     for warning in &session.warnings {
@@ -102,6 +116,9 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         run.patches(),
         run.config().patches_per_step()
     ));
+    if let Some(count) = arguments.ranks {
+        say(session.predict(usize::from(count.get()), arguments.bandwidth)?);
+    }
     if arguments.check {
         say(match session.warnings.len() {
             0 => "check: configuration and data are valid; nothing was written".to_owned(),

@@ -14,11 +14,11 @@ mod source;
 mod train;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
-use std::io::{self, Read};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use demc_data::DataConfig;
+use demc_data::file::{MAX_CONFIGURATION, read_text};
 use demc_data::message::printable;
 use demc_model::kernel_head::GAMMA;
 use demc_model::{Head, LossConfig, ModelConfig, Variant};
@@ -31,9 +31,6 @@ pub use optimizer::{OptimizerConfig, OptimizerKind};
 pub use run::RunConfig;
 pub(crate) use source::one_line;
 pub use train::{OnNan, TrainConfig};
-
-/// Largest configuration file, bytes. Ours: the files of this project have 4 KB.
-const MAX_BYTES: u64 = 1 << 20;
 
 /// The configuration of a run, one field per table.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -87,7 +84,7 @@ impl Config {
             path: path.into(),
             source,
         };
-        let text = read_text(path).map_err(read_error)?;
+        let text = read_text(path, MAX_CONFIGURATION).map_err(read_error)?;
         let mut config = Self::parse(path, &text, sets)?;
         let default_dir = || Path::new("runs").join(path.file_stem().unwrap_or_default());
         config.run.dir.get_or_insert_with(default_dir);
@@ -286,18 +283,6 @@ pub fn utf8<'a>(key: &str, path: &'a Path) -> Result<&'a str, ConfigError> {
             "{key}: {shown}: not UTF-8, as a configuration requires; rename it or choose another"
         ))
     })
-}
-
-fn read_text(path: &Path) -> io::Result<String> {
-    let mut text = String::new();
-    File::open(path)?
-        .take(MAX_BYTES + 1)
-        .read_to_string(&mut text)?;
-    if text.len() as u64 > MAX_BYTES {
-        let why = format!("more than {MAX_BYTES} bytes; expected a configuration in TOML");
-        return Err(io::Error::new(io::ErrorKind::InvalidData, why));
-    }
-    Ok(text)
 }
 
 #[cfg(test)]

@@ -1,5 +1,7 @@
 //! The table `[optimizer]`.
 
+use std::ops::RangeInclusive;
+
 use serde::{Deserialize, Serialize};
 
 use super::problems::{MAX_STEPS, TableProblems};
@@ -9,6 +11,8 @@ use crate::step::schedule::LrDecay;
 const LR_START: f64 = 1e-4;
 /// Last learning rate (Sec. 4.2).
 const LR_END: f64 = 5e-6;
+/// Learning rates. Ours: those of trainings are from 1e-7 to 0.1, and others end in NaN.
+const RATES: RangeInclusive<f64> = 1e-30..=10.0;
 /// Adam's epsilon (Kingma and Ba 2014).
 const ADAM_EPSILON: f32 = 1e-8;
 /// Largest matrix for Muon, in rows. Ours: every kernel of the level widths that this project
@@ -72,13 +76,12 @@ impl OptimizerConfig {
     /// Every value out of range, one line each.
     pub fn validate(&self) -> Vec<String> {
         let mut problems = TableProblems::of("optimizer");
-        for (key, value) in [
-            ("lr_start", self.lr_start),
-            ("lr_end", self.lr_end),
-            ("adam_epsilon", self.adam_epsilon.into()),
-        ] {
-            problems.require_positive(key, value);
+        let (least, most) = RATES.into_inner();
+        for (key, value) in [("lr_start", self.lr_start), ("lr_end", self.lr_end)] {
+            let allowed = format!("from {least:e} to {most}");
+            problems.require(RATES.contains(&value), key, &value, &allowed);
         }
+        problems.require_positive("adam_epsilon", self.adam_epsilon.into());
         if let Some(norm) = self.max_grad_norm {
             let holds = norm.is_finite() && norm > 0.0;
             let allowed = "a positive number, or absent for no clipping";
@@ -136,6 +139,21 @@ mod tests {
         assert_eq!(config.muon_rows(), Some(64));
         config.muon_max_rows = None;
         assert_eq!(config.muon_rows(), Some(128));
+    }
+
+    #[test]
+    fn learning_rates_that_only_give_nan_are_refused() {
+        for rate in [0.0, 5e-324, 1e-300, 525_600.0, 1e300, f64::NAN] {
+            let config = OptimizerConfig {
+                lr_start: rate,
+                lr_end: rate,
+                ..OptimizerConfig::default()
+            };
+            let problems = config.validate();
+            assert_eq!(problems.len(), 2, "{problems:?}");
+            let expected = format!("optimizer.lr_start = {rate:?}: must be from 1e-30 to 10");
+            assert_eq!(problems[0], expected);
+        }
     }
 
     #[test]

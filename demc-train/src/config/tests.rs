@@ -272,6 +272,7 @@ fn the_reference_page_lists_every_key_with_type_and_default() {
         let kinds: &[&str] = match value {
             Value::Integer(_) => &["integer"],
             Value::Float(_) => &["float"],
+            Value::Boolean(_) => &["boolean"],
             Value::Array(_) => &["list"],
             _ => &["string", "path"],
         };

@@ -150,12 +150,16 @@ impl MetricsLog {
     }
 }
 
-/// The duration of a run in seconds, from the last line of its log.
+/// The duration of a run in seconds, from the last intact line of its log.
 pub fn elapsed(path: &Path) -> Option<f64> {
-    let text = fs::read_to_string(path).ok()?;
-    let mut lines = text.lines().rev();
-    let line = lines.find_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())?;
-    line.get("elapsed_s")?.as_f64()
+    let bytes = fs::read(path).ok()?;
+    let StoredLines { lines, .. } = read_lines::<LineTime>(&bytes);
+    lines.last().map(|(_, line)| line.elapsed_s)
+}
+
+#[derive(Deserialize)]
+struct LineTime {
+    elapsed_s: f64,
 }
 
 /// The key that every line has.

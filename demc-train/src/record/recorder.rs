@@ -16,8 +16,16 @@ use crate::run::validation::write_strip;
 /// Directory of the TensorBoard events in a run directory.
 const TENSORBOARD: &str = "tensorboard";
 
+/// TensorBoard's name for the share of a step that ranks spend on exchanges.
+const EXCHANGE: &str = "train/exchange_share";
+
 /// The records of one session.
-pub struct Recorder {
+pub struct Recorder(
+    /// `None` on ranks that record nothing.
+    Option<Records>,
+);
+
+struct Records {
     run: PathBuf,
     metrics: MetricsLog,
     events: EventFile,
@@ -53,19 +61,26 @@ impl Recorder {
             ));
         }
         let per_step = config.patches_per_step();
-        Ok(Recorder {
+        Ok(Recorder(Some(Records {
             run: dir.path().into(),
             metrics,
             events,
             progress,
             pace: Pace::new(per_step),
-        })
+        })))
     }
 
-    /// Records a step and its duration.
-    pub fn step(&mut self, step: u64, loss: f64, time: Duration) {
-        self.pace.step(time);
-        self.progress.step(step, loss);
+    /// Records nothing, on ranks other than the first.
+    pub fn silent() -> Self {
+        Recorder(None)
+    }
+
+    /// Records a step, its duration, and the part of it that went into exchanges between ranks.
+    pub fn step(&mut self, step: u64, loss: f64, time: Duration, exchange: Duration) {
+        if let Recorder(Some(records)) = self {
+            records.pace.step(time, exchange);
+            records.progress.step(step, loss);
+        }
     }
 
     /// Writes a line of the log, with patches per second since the previous line, and `text` to the
@@ -74,10 +89,19 @@ impl Recorder {
     /// # Errors
     /// A file that cannot be written.
     pub fn line(&mut self, mut line: MetricsLine, text: &str) -> anyhow::Result<()> {
-        line.patches_per_s = self.pace.take();
-        self.metrics.append(&line)?;
-        self.events.scalars(line.step, &line.scalars())?;
-        self.progress.line(text);
+        let Recorder(Some(records)) = self else {
+            return Ok(());
+        };
+        let exchange = records.pace.exchange_share();
+        line.patches_per_s = records.pace.take();
+        records.metrics.append(&line)?;
+        let mut scalars = line.scalars();
+        scalars.extend(exchange.map(|share| (EXCHANGE, share)));
+        records.events.scalars(line.step, &scalars)?;
+        records.progress.line(match exchange {
+            Some(share) => format!("{text}  exchange {:.1} %", 100.0 * share),
+            None => text.to_owned(),
+        });
         Ok(())
     }
 
@@ -86,21 +110,29 @@ impl Recorder {
     /// # Errors
     /// A file that cannot be written.
     pub fn picture(&mut self, step: u64, picture: &Picture) -> anyhow::Result<()> {
-        write_strip(&self.run, &format!("step-{step:08}.png"), picture)?;
+        let Recorder(Some(records)) = self else {
+            return Ok(());
+        };
+        write_strip(&records.run, &format!("step-{step:08}.png"), picture)?;
         let (width, height) = picture.size();
         let tag = "validation/noisy, detail map, denoised, reference";
-        self.events
+        records
+            .events
             .image(step, tag, width, height, &picture.to_png()?)
     }
 
     /// Prints a line on the terminal alone.
     pub fn say(&self, text: &str) {
-        self.progress.line(printable(text));
+        if let Recorder(Some(records)) = self {
+            records.progress.line(printable(text));
+        }
     }
 
     /// Removes the progress bar.
     pub fn finish(&self) {
-        self.progress.finish();
+        if let Recorder(Some(records)) = self {
+            records.progress.finish();
+        }
     }
 }
 
@@ -108,6 +140,7 @@ struct Pace {
     patches_per_step: u64,
     steps: u64,
     time: Duration,
+    exchange: Duration,
 }
 
 impl Pace {
@@ -116,19 +149,27 @@ impl Pace {
             patches_per_step,
             steps: 0,
             time: Duration::ZERO,
+            exchange: Duration::ZERO,
         }
     }
 
-    fn step(&mut self, time: Duration) {
+    fn step(&mut self, time: Duration, exchange: Duration) {
         self.steps += 1;
         self.time += time;
+        self.exchange += exchange;
+    }
+
+    /// Share of the time since the last `take` that went into exchanges; `None` with one rank.
+    fn exchange_share(&self) -> Option<f64> {
+        let share = self.exchange.as_secs_f64() / self.time.as_secs_f64();
+        (!self.exchange.is_zero()).then_some(share)
     }
 
     /// Patches per second since the last call; 0 without a step.
     fn take(&mut self) -> f64 {
         let patches = (self.steps * self.patches_per_step) as f64;
         let seconds = self.time.as_secs_f64();
-        (self.steps, self.time) = (0, Duration::ZERO);
+        (self.steps, self.time, self.exchange) = (0, Duration::ZERO, Duration::ZERO);
         if seconds > 0.0 {
             patches / seconds
         } else {

@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use demc_data::checksum::sha256_of;
 use demc_data::content;
 use demc_data::exr::ExrFile;
@@ -11,16 +12,18 @@ use demc_data::frame::{FramePlanes, Presence};
 use demc_data::message::short_list;
 use demc_data::output::Outputs;
 use demc_data::{
-    ChannelLayout, DataConfig, Dataset, Dropout, Normalizer, PatchSource, Ranges, Scene, Split,
-    Statistics,
+    BatchLoader, ChannelLayout, DataConfig, Dataset, Dropout, Normalizer, PatchSource, Ranges,
+    Scene, Split, Statistics,
 };
 use demc_infer::bundle::{BundleMeta, locate};
 use demc_model::ModelConfig;
+use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
+use crate::ranks::{OnNode, Ranks};
 
 /// The scenes and statistics of a run.
-#[derive(Debug)]
+#[derive(Debug, Serialize, Deserialize)]
 pub struct RunData {
     /// Channels of the files.
     pub layout: ChannelLayout,
@@ -90,12 +93,26 @@ pub fn protect_inputs(
     Ok(())
 }
 
+/// The batches of this rank's share of the steps from `step` on, in steps of `per_step` batches.
+pub fn rank_loader(
+    source: Arc<PatchSource>,
+    ranks: &Ranks,
+    per_step: usize,
+    step: u64,
+) -> BatchLoader {
+    let share = ranks.share(per_step);
+    let (first, own) = (share.start as u64, share.len() as u64);
+    let number = move |n: u64| n / own * per_step as u64 + first + n % own;
+    BatchLoader::of_numbers(source, step * own, number)
+}
+
 impl RunData {
     /// Opens the data set and reads every scene once, so that an invalid one is found before the
     /// first step. The seed draws the validation scenes.
     ///
     /// # Errors
-    /// An invalid layout, manifest or image; a training split without scenes.
+    /// An invalid layout, manifest or image; a training split without scenes, or whose scenes are
+    /// all black or beyond the range of the loss.
     pub fn open(config: &Config) -> anyhow::Result<Self> {
         let DataConfig {
             root,
@@ -120,6 +137,13 @@ impl RunData {
         let statistics =
             Statistics::measure(&train, &layout, &config.data, config.loss.relmse_epsilon)
                 .context("measuring the training scenes")?;
+        let unusable = content::unusable(&statistics.suspicious);
+        ensure!(
+            unusable.is_empty(),
+            "data set {}: no training scene can be learned from: {}; render them again or correct data.layout",
+            root.display(),
+            unusable.join("; ")
+        );
         let (mut clamped, mut suspicious) = (statistics.clamped, statistics.suspicious);
         let present = Presence::IfPresent;
         for scene in validation.iter().chain(&test) {
@@ -150,13 +174,37 @@ impl RunData {
         })
     }
 
-    /// The source of the training patches.
+    /// Compares the files on this node with the checksums. The ranks of the node share the work.
+    ///
+    /// # Errors
+    /// The first scene that is missing or differs.
+    pub fn check_files(&self, on_node: OnNode) -> anyhow::Result<()> {
+        let scenes = self.train.iter().chain(&self.validation).chain(&self.test);
+        for scene in scenes.skip(on_node.rank).step_by(on_node.count) {
+            let found = sha256_of(&scene.path).with_context(|| format!("scene {}", scene.name))?;
+            ensure!(
+                self.checksums.get(&scene.name) == Some(&found),
+                "scene {}: {} differs from the file of rank 0",
+                scene.name,
+                scene.path.display()
+            );
+        }
+        Ok(())
+    }
+
+    /// The source of the training patches. The ranks of a node share `data.cache_mib`.
     ///
     /// # Errors
     /// Scenes smaller than a patch.
-    pub fn patch_source(&self, config: &Config) -> Result<PatchSource, demc_data::Error> {
+    pub fn patch_source(
+        &self,
+        config: &Config,
+        on_node: OnNode,
+    ) -> Result<PatchSource, demc_data::Error> {
+        let mut data = config.data.clone();
+        data.cache_mib /= on_node.count;
         PatchSource::new(
-            &config.data,
+            &data,
             self.train.clone(),
             self.layout.clone(),
             self.normalizer.clone(),

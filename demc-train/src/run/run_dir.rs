@@ -97,6 +97,14 @@ impl RunDir {
         Ok(dir)
     }
 
+    /// The directory on ranks that write nothing into it.
+    pub fn unclaimed(config: &Config) -> Self {
+        RunDir {
+            path: config.run_dir().to_path_buf(),
+            lock: None,
+        }
+    }
+
     /// The configuration of the run in the directory: its own, or that of the newest intact
     /// checkpoint if it is missing or damaged. `None` without either.
     fn saved_config(&self) -> anyhow::Result<Option<Config>> {

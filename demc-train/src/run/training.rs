@@ -5,20 +5,21 @@ use std::sync::Arc;
 use anyhow::{Context, bail, ensure};
 use burn::module::Module;
 use burn::tensor::Device;
-use demc_data::{BatchLoader, PatchSource};
+use demc_data::PatchSource;
 use demc_infer::bundle::locate::BEST;
 use demc_infer::bundle::{Bundle, Names, Precision};
 use demc_infer::evaluate::Report;
 use demc_model::Denoiser;
 
 use crate::config::{Config, OnNan};
+use crate::ranks::Ranks;
 use crate::record::metrics_log::MetricsLine;
 use crate::record::recorder::{Recorder, timed};
-use crate::run::checkpoint::store::{CheckpointRetention, CheckpointStore};
+use crate::run::checkpoint::store::CheckpointStore;
 use crate::run::checkpoint::{
     self, BestValidation, Checkpoint, LoopState, MetricSums, SessionClock,
 };
-use crate::run::data::RunData;
+use crate::run::data::{RunData, rank_loader};
 use crate::run::initial::{InitialNetwork, InitialWeights, initial_network};
 use crate::run::run_dir::{RunDir, SCORES};
 use crate::run::run_record::RunFacts;
@@ -27,6 +28,7 @@ use crate::run::validation::{self, Validation};
 use crate::run::warnings::LoopFacts;
 use crate::step::optimizer::{DormantChannels, Optimizer};
 use crate::step::trainer::{StepReport, Trainer};
+use crate::tools::estimate::DurationEstimate;
 
 /// Consecutive skipped steps after which a run fails despite `train.on_nan = "skip"`; ours.
 const MAX_SKIPPED: u64 = 100;
@@ -45,6 +47,7 @@ pub struct TrainingRun {
     initial: Option<InitialWeights>,
     /// Steps skipped since the last one that was taken.
     skipped_in_a_row: u64,
+    ranks: Ranks,
 }
 
 /// How the training loop ended.
@@ -62,7 +65,7 @@ pub enum LoopEnd {
 }
 
 impl TrainingRun {
-    /// A new run, or the run of `checkpoint` at its step. `device` has no autodiff.
+    /// A new run of `ranks`, or the run of `checkpoint` at its step. `device` has no autodiff.
     ///
     /// # Errors
     /// Scenes smaller than a patch; a checkpoint of another run; a `train.init` of another network.
@@ -72,9 +75,10 @@ impl TrainingRun {
         dir: RunDir,
         checkpoint: Option<Checkpoint>,
         device: &Device,
+        ranks: Ranks,
     ) -> anyhow::Result<Self> {
         let device = device.clone().autodiff();
-        let source = data.patch_source(&config)?;
+        let source = data.patch_source(&config, ranks.on_node())?;
         let (model, albedo_filter, average, optimizer, state, initial) = match checkpoint {
             Some(Checkpoint {
                 bundle,
@@ -123,7 +127,7 @@ impl TrainingRun {
                 )
             }
         };
-        let trainer = Trainer::new(&config, model, optimizer, average, device);
+        let trainer = Trainer::new(&config, model, optimizer, average, device).on(ranks.clone());
         Ok(TrainingRun {
             config,
             data,
@@ -134,6 +138,7 @@ impl TrainingRun {
             state,
             initial,
             skipped_in_a_row: 0,
+            ranks,
         })
     }
 
@@ -150,6 +155,12 @@ impl TrainingRun {
     /// Patches per epoch.
     pub fn patches(&self) -> usize {
         self.source.patches().len()
+    }
+
+    /// The estimated duration of the steps after `first_step` on this many ranks, without exchanges.
+    pub fn estimate(&self, first_step: u64, device: &Device, ranks: usize) -> DurationEstimate {
+        let autodiff = device.clone().autodiff();
+        DurationEstimate::measure(&self.config, &self.data, first_step, &autodiff, ranks)
     }
 
     /// Number of trainable parameters.
@@ -169,17 +180,19 @@ impl TrainingRun {
         let rate = self.config.learning_rate();
         let scenes = self.data.train.iter();
         let scenes: Vec<String> = scenes.map(|scene| scene.name.clone()).collect();
-        let first_batch = self.state.step * train.grad_accumulation as u64;
-        let mut loader = BatchLoader::new(self.source.clone(), first_batch);
+        let per_step = train.grad_accumulation;
+        let source = self.source.clone();
+        let mut loader = rank_loader(source, &self.ranks, per_step, self.state.step);
         let signals = Signals::listen()?;
         let mut clock = SessionClock::new(self.state.elapsed_s, run.checkpoint_interval());
         while self.state.step < train.steps {
             let lr = rate.at(self.state.step);
             let (report, time) = timed(|| self.trainer.step(lr, || loader.next()));
             let report = report?;
+            let exchange = self.ranks.take_time();
             let mut warnings = self.count(&report, lr, &scenes)?;
             let step = self.state.step;
-            recorder.step(step, report.loss, time);
+            recorder.step(step, report.loss, time, exchange);
             self.state.elapsed_s = clock.elapsed();
             let due = |every: u64| step.is_multiple_of(every) || step == train.steps;
             let mut validation = None;
@@ -200,8 +213,8 @@ impl TrainingRun {
             for warning in warnings {
                 recorder.say(&format!("warning: step {step}: {warning}"));
             }
-            let signal = signals.received();
-            if due(run.checkpoint_every) || clock.checkpoint_is_due() || signal.is_some() {
+            let (signal, is_time) = self.requests(signals.received(), clock.checkpoint_is_due())?;
+            if due(run.checkpoint_every) || is_time || signal.is_some() {
                 self.save()?;
                 clock.checkpoint_saved();
             }
@@ -220,12 +233,26 @@ impl TrainingRun {
         Ok(LoopEnd::Done)
     }
 
+    /// The first signal that a rank received, and whether rank 0's clock asks for a checkpoint. All
+    /// ranks get the same answer, so they stop after the same step.
+    fn requests(&self, signal: Option<i32>, is_time: bool) -> anyhow::Result<(Option<i32>, bool)> {
+        let requests = self.ranks.gather(Ok((signal, is_time)))?;
+        let signal = requests.iter().find_map(|(signal, _)| *signal);
+        Ok((
+            signal,
+            requests.first().is_some_and(|(_, is_time)| *is_time),
+        ))
+    }
+
     /// Whether no step has changed the weights.
     fn is_untrained(&self) -> bool {
         self.state.skipped == self.state.step
     }
 
     fn open_records(&mut self, device: &str) -> anyhow::Result<Recorder> {
+        if !self.ranks.is_first() {
+            return Ok(Recorder::silent());
+        }
         let facts = RunFacts {
             device,
             operations: &self.trainer.operations(),
@@ -297,21 +324,21 @@ impl TrainingRun {
         )
     }
 
+    /// Writes a checkpoint, on rank 0.
     fn save(&self) -> anyhow::Result<()> {
+        if !self.ranks.is_first() {
+            return Ok(());
+        }
         let bundle = self.bundle(self.trainer.model().valid());
         let average = self.trainer.average();
         let average = average.cloned().map(|model| self.bundle(model));
-        let retention = CheckpointRetention {
-            newest: self.config.run.keep,
-            every: self.config.run.keep_every,
-        };
         checkpoint::save(
             self.dir.path(),
             &bundle,
             average.as_ref(),
             self.trainer.optimizer(),
             &self.state,
-            retention,
+            checkpoint::retention(&self.config),
         )
     }
 
@@ -321,7 +348,8 @@ impl TrainingRun {
             return Ok(None);
         }
         let bundle = self.bundle(self.trainer.result());
-        let found = validation::score(&bundle, &self.data.validation, validation::STRIP_SCENES)
+        let strips = validation::STRIP_SCENES;
+        let found = validation::score(&bundle, &self.data.validation, strips, &self.ranks)
             .context("validation")?;
         let step = self.state.step;
         if let Some(picture) = &found.picture {
@@ -329,7 +357,9 @@ impl TrainingRun {
         }
         let relmse = found.report.mean.denoised.relmse;
         if self.state.best.is_none_or(|best| relmse < best.relmse) {
-            bundle.save(&self.dir.path().join(BEST), Names::Burn, Precision::F32)?;
+            if self.ranks.is_first() {
+                bundle.save(&self.dir.path().join(BEST), Names::Burn, Precision::F32)?;
+            }
             self.state.best = Some(BestValidation { step, relmse });
         }
         Ok(Some(found))
@@ -389,7 +419,10 @@ impl TrainingRun {
         };
         let Validation {
             report, picture, ..
-        } = validation::score(&bundle, &self.data.test, usize::MAX).context("test")?;
+        } = validation::score(&bundle, &self.data.test, usize::MAX, &self.ranks).context("test")?;
+        if !self.ranks.is_first() {
+            return Ok(Some((bundle.meta.step, report)));
+        }
         if let Some(picture) = picture {
             validation::write_strip(self.dir.path(), "test.png", &picture)?;
         }

@@ -11,6 +11,8 @@ use demc_infer::picture::Picture;
 use demc_model::config::DETAIL_CHANNELS;
 use serde::{Deserialize, Serialize};
 
+use crate::ranks::Ranks;
+
 /// Number of scenes in the picture of a validation: always the first ones. Ours.
 pub const STRIP_SCENES: usize = 3;
 
@@ -41,52 +43,87 @@ pub struct NetworkHealth {
     pub zero_share: f64,
 }
 
-/// Denoises and scores `scenes`, one at a time, and draws the first `strips` of them.
+/// The result of one scene.
+#[derive(Debug, Serialize, Deserialize)]
+struct SceneResult {
+    score: ImageScore,
+    /// Zeros in each channel of the detail map; `None` for a network without one.
+    dark: Option<Vec<usize>>,
+    pixels: usize,
+    /// Output values of 0 where the reference is not black, and such reference values.
+    zeros: usize,
+    bright: usize,
+    picture: Option<Picture>,
+}
+
+/// Denoises and scores `scenes`, one at a time, and draws the first `strips` of them. The scenes are
+/// dealt out to `ranks`; each gets the whole result.
 ///
 /// # Errors
 /// A scene that cannot be read or has no reference.
-pub fn score(bundle: &Bundle, scenes: &[Scene], strips: usize) -> anyhow::Result<Validation> {
-    let mut scores = Vec::with_capacity(scenes.len());
-    let mut rows = Vec::new();
-    let (mut dark, mut pixels) = ([0; DETAIL_CHANNELS], 0);
-    let (mut zeros, mut bright) = (0usize, 0usize);
-    for (index, scene) in scenes.iter().enumerate() {
-        let frame = read_frame(&scene.path, &bundle.meta.layout)?;
-        let denoised = bundle.denoise(&frame)?;
-        scores.push(ImageScore {
+pub fn score(
+    bundle: &Bundle,
+    scenes: &[Scene],
+    strips: usize,
+    ranks: &Ranks,
+) -> anyhow::Result<Validation> {
+    let own = scenes.iter().enumerate();
+    let own = own.filter(|(index, _)| index % ranks.count() == ranks.rank());
+    let own: anyhow::Result<Vec<SceneResult>> = own
+        .map(|(index, scene)| score_scene(bundle, scene, index < strips))
+        .collect();
+    let mut dealt: Vec<_> = ranks.gather(own)?.into_iter().map(Vec::into_iter).collect();
+    let in_order = (0..scenes.len()).filter_map(|index| dealt[index % ranks.count()].next());
+    Ok(whole(in_order.collect()))
+}
+
+fn score_scene(bundle: &Bundle, scene: &Scene, draws: bool) -> anyhow::Result<SceneResult> {
+    let frame = read_frame(&scene.path, &bundle.meta.layout)?;
+    let denoised = bundle.denoise(&frame)?;
+    let (mut zeros, mut bright) = (0, 0);
+    for (out, reference) in denoised.iter().zip(frame.reference.iter().flatten()) {
+        bright += usize::from(*reference > NOT_BLACK);
+        zeros += usize::from(*reference > NOT_BLACK && *out == 0.0);
+    }
+    let detail_map = bundle.detail_map(&frame)?;
+    let dark = detail_map.as_ref().map(|map| {
+        let channels = map.chunks_exact(map.len() / DETAIL_CHANNELS);
+        let dark = channels.map(|channel| channel.iter().filter(|value| **value == 0.0).count());
+        dark.collect()
+    });
+    Ok(SceneResult {
+        score: ImageScore {
             name: scene.name.clone(),
             ..ImageScore::new(&frame, &denoised, scene.ref_residual_relmse)?
-        });
-        for (out, reference) in denoised.iter().zip(frame.reference.iter().flatten()) {
-            bright += usize::from(*reference > NOT_BLACK);
-            zeros += usize::from(*reference > NOT_BLACK && *out == 0.0);
-        }
-        let detail_map = bundle.detail_map(&frame)?;
-        if let Some(map) = &detail_map {
-            let channels = map.chunks_exact(map.len() / DETAIL_CHANNELS);
-            for (dark, channel) in dark.iter_mut().zip(channels) {
-                *dark += channel.iter().filter(|value| **value == 0.0).count();
-            }
-            pixels += frame.width * frame.height;
-        }
-        if index < strips {
-            rows.push(Picture::strip(&frame, detail_map.as_deref(), &denoised));
-        }
-    }
-    let picture = (!rows.is_empty()).then(|| Picture::above(&rows));
-    let has_map = bundle.meta.model.variant.spec().has_fusion();
-    let health = NetworkHealth {
-        dead_channels: has_map.then(|| {
-            let limit = DEAD * pixels as f64;
-            dark.iter().filter(|dark| **dark as f64 >= limit).count()
-        }),
-        zero_share: zeros as f64 / bright.max(1) as f64,
-    };
-    Ok(Validation {
-        report: Report::new(scores),
-        health,
-        picture,
+        },
+        dark,
+        pixels: frame.width * frame.height,
+        zeros,
+        bright,
+        picture: draws.then(|| Picture::strip(&frame, detail_map.as_deref(), &denoised)),
     })
+}
+
+/// The validation of these scenes.
+fn whole(mut scenes: Vec<SceneResult>) -> Validation {
+    let pictures = scenes.iter_mut().filter_map(|scene| scene.picture.take());
+    let pictures: Vec<Picture> = pictures.collect();
+    let sum = |of: fn(&SceneResult) -> usize| scenes.iter().map(of).sum::<usize>();
+    let limit = DEAD * sum(|scene| scene.pixels) as f64;
+    let is_dead = |channel: &usize| {
+        let dark = scenes.iter().filter_map(|scene| scene.dark.as_ref());
+        dark.map(|dark| dark[*channel]).sum::<usize>() as f64 >= limit
+    };
+    let has_map = scenes.iter().any(|scene| scene.dark.is_some());
+    let health = NetworkHealth {
+        dead_channels: has_map.then(|| (0..DETAIL_CHANNELS).filter(is_dead).count()),
+        zero_share: sum(|scene| scene.zeros) as f64 / sum(|scene| scene.bright).max(1) as f64,
+    };
+    Validation {
+        picture: (!pictures.is_empty()).then(|| Picture::above(&pictures)),
+        report: Report::new(scenes.into_iter().map(|scene| scene.score).collect()),
+        health,
+    }
 }
 
 /// Writes a picture into the run directory.

@@ -1,5 +1,4 @@
-//! Adam (Kingma and Ba 2014), or Muon (Jordan et al. 2024) for kernels, and the norm and clipping
-//! of a gradient.
+//! Adam (Kingma and Ba 2014), or Muon (Jordan et al. 2024) for kernels.
 //!
 //! [`demc_model::ops::update`] and [`demc_model::ops::muon`] compute a step. The state is kept here,
 //! by the names of the weights: Burn's whole-module optimizer restores state on a default device,
@@ -7,12 +6,11 @@
 
 use std::collections::BTreeMap;
 
-use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::module::{Module, ModuleMapper, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_model::ops::muon;
-use demc_model::ops::update::{AdamConstants, AdamMoments, sum_of_squares};
-
+use demc_model::ops::update::{AdamConstants, AdamMoments};
 use demc_model::{Denoiser, Ops, Role, Stage, Weight, WeightSpec};
 
 use crate::config::Config;
@@ -281,45 +279,6 @@ impl ModuleMapper for OptimizerStep<'_> {
         let tensor = Tensor::from_inner(stepped).require_grad();
         Param::from_mapped_value(id, tensor, mapper)
     }
-}
-
-/// The Euclidean norm of the whole gradient.
-pub fn grad_norm(model: &Denoiser, grads: &GradientsParams) -> f64 {
-    struct FlatGradients<'a> {
-        grads: &'a GradientsParams,
-        tensors: Vec<Tensor<1>>,
-    }
-    impl ModuleVisitor for FlatGradients<'_> {
-        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            if let Some(grad) = self.grads.get::<D>(param.id) {
-                self.tensors.push(grad.reshape([-1]));
-            }
-        }
-    }
-    let mut flat = FlatGradients {
-        grads,
-        tensors: Vec::new(),
-    };
-    model.visit(&mut flat);
-    sum_of_squares(model.ops(), flat.tensors).sqrt()
-}
-
-/// The gradient times `factor`.
-pub fn scaled(model: &Denoiser, grads: GradientsParams, factor: f64) -> GradientsParams {
-    struct GradientScaler {
-        grads: GradientsParams,
-        factor: f64,
-    }
-    impl ModuleVisitor for GradientScaler {
-        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            if let Some(grad) = self.grads.remove::<D>(param.id) {
-                self.grads.register(param.id, grad.mul_scalar(self.factor));
-            }
-        }
-    }
-    let mut scaler = GradientScaler { grads, factor };
-    model.visit(&mut scaler);
-    scaler.grads
 }
 
 #[cfg(test)]

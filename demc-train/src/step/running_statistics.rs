@@ -1,13 +1,19 @@
-//! Snapshot of batch normalisation's running statistics, restored after a skipped step: the forward
-//! pass updates them before the loss is known to be non-finite.
+//! Batch normalisation's running statistics: a snapshot, and their update in the order of the
+//! micro-batches.
+//!
+//! A forward pass updates them before the loss is known to be non-finite, and each rank sees its own
+//! micro-batches only. So a step starts each forward pass from zeros, collects the shares of all
+//! micro-batches, and adds them at its end.
 
 use std::collections::VecDeque;
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::Tensor;
+use demc_model::layers::NORM_MOMENTUM;
 use demc_model::{Denoiser, WeightSpec};
 
-/// The running statistics of a network at one moment.
+/// The running statistics of a network at one moment; empty without batch normalisation.
+#[derive(Clone)]
 pub struct RunningStatistics(VecDeque<Tensor<1>>);
 
 impl RunningStatistics {
@@ -23,8 +29,50 @@ impl RunningStatistics {
         RunningStatistics(collector.found)
     }
 
+    /// Zeros instead of these statistics. A forward pass turns them into its batch's share: the
+    /// batch's statistics times the momentum.
+    pub fn zeros(&self) -> Self {
+        let zeros = self.0.iter().map(Tensor::zeros_like);
+        RunningStatistics(zeros.collect())
+    }
+
+    /// The values as bits, in module order.
+    pub fn bits(&self) -> Vec<u32> {
+        let values = self.0.iter().flat_map(|statistic| {
+            let values = statistic.to_data().try_to_vec::<f32>();
+            values.expect("statistics are float32")
+        });
+        values.map(f32::to_bits).collect()
+    }
+
+    /// These statistics after batches with these shares, in order:
+    /// `running (1 - momentum) + share` for each, as in the forward pass.
+    ///
+    /// # Panics
+    /// If a share has too few values.
+    pub fn updated<'a>(&self, shares: impl Iterator<Item = &'a [u32]>) -> Self {
+        let kept = (1.0 - NORM_MOMENTUM) as f32;
+        let mut values: Vec<f32> = self.bits().into_iter().map(f32::from_bits).collect();
+        for share in shares {
+            assert_eq!(share.len(), values.len(), "the same network");
+            for (value, share) in values.iter_mut().zip(share) {
+                *value = *value * kept + f32::from_bits(*share);
+            }
+        }
+        let mut rest = values.as_slice();
+        let statistics = self.0.iter().map(|statistic| {
+            let (own, after) = rest.split_at(statistic.dims()[0]);
+            rest = after;
+            Tensor::from_floats(own, &statistic.device())
+        });
+        RunningStatistics(statistics.collect())
+    }
+
     /// `model` with these statistics.
     pub fn restore(self, model: Denoiser, specs: &[WeightSpec]) -> Denoiser {
+        if self.0.is_empty() {
+            return model;
+        }
         let _ = model.valid();
         model.map(&mut StatisticsRestorer {
             specs: specs.iter(),

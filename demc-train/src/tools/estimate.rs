@@ -42,11 +42,17 @@ pub struct DurationEstimate {
 }
 
 impl DurationEstimate {
-    /// Estimates the time of the steps after `first_step`.
+    /// Estimates the time of the steps after `first_step` on `ranks` ranks, without their exchanges.
     ///
     /// It times steps on one patch and on four, which gives the time per patch and the constant
-    /// time per step.
-    pub fn measure(config: &Config, data: &RunData, first_step: u64, device: &Device) -> Self {
+    /// time per step. With `data.batch_size = 1` the four are micro-batches.
+    pub fn measure(
+        config: &Config,
+        data: &RunData,
+        first_step: u64,
+        device: &Device,
+        ranks: usize,
+    ) -> Self {
         let mut single = config.clone();
         single.train.grad_accumulation = 1;
         let model = random_network(&config.model, 0, data.normalizer.flat_color, device);
@@ -57,32 +63,44 @@ impl DurationEstimate {
             None,
             device.clone(),
         );
-        let mut time_step = |batch: &Batch| {
+        let mut time_step = |batches: usize, batch: &Batch| {
+            trainer.set_grad_accumulation(batches);
             let started = Instant::now();
-            let Ok(_) = trainer.step(0.0, || Ok::<_, Infallible>(batch.clone()));
+            trainer
+                .step(0.0, || Ok::<_, Infallible>(batch.clone()))
+                .expect("no batch fails");
             started.elapsed().as_secs_f64()
         };
-        let mut time = |patches: usize| {
+        let mut time = |batches: usize, patches: usize| {
             let batch = Batch::grey(patches, config.data.patch_size);
             let (mut least, mut spent, mut times) = (f64::INFINITY, 0.0, 0);
             while times < 2 && spent < LONG_STEP || times < REPETITIONS && spent < TIME_LIMIT {
-                let time = time_step(&batch);
+                let time = time_step(batches, &batch);
                 (least, spent, times) = (least.min(time), spent + time, times + 1);
             }
             least
         };
         // At most a batch of the run: memory may not suffice for more.
         let large = LARGE_BATCH.min(config.data.batch_size);
-        let one = time(1);
-        let patch_time = patch_time(one, large, if large > 1 { time(large) } else { one });
+        let one = time(1, 1);
+        let patch_time = match config.train.grad_accumulation {
+            _ if large > 1 => patch_time(one, large, time(1, large)),
+            1 => one,
+            batches => patch_time(
+                one,
+                LARGE_BATCH.min(batches),
+                time(LARGE_BATCH.min(batches), 1),
+            ),
+        };
         let pixels: usize = data
             .validation
             .iter()
             .map(|scene| scene.width * scene.height)
             .sum();
         let patches = pixels as f64 / (config.data.patch_size * config.data.patch_size) as f64;
-        let step = one + patch_time * (config.patches_per_step() - 1) as f64;
-        let validation = patch_time * patches * FORWARD_SHARE;
+        let own_patches = config.patches_per_step() / ranks as u64;
+        let step = one + patch_time * (own_patches - 1) as f64;
+        let validation = patch_time * patches * FORWARD_SHARE / ranks as f64;
         let steps = config.train.steps.saturating_sub(first_step) as f64;
         let remaining = steps * (step + validation / config.run.validate_every as f64);
         DurationEstimate {
@@ -90,6 +108,44 @@ impl DurationEstimate {
             validation,
             remaining,
         }
+    }
+}
+
+/// Seconds per message between two nodes. Ours: measured over TCP by benches/scaling.py.
+const LATENCY: f64 = 5e-5;
+
+/// A model of a step on a cluster, with one rank per node like this computer.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ClusterEstimate {
+    /// Ranks.
+    pub ranks: usize,
+    /// Seconds of forward and backward pass.
+    pub compute: f64,
+    /// Seconds of the exchange.
+    pub exchange: f64,
+    /// Bytes that each rank sends.
+    pub bytes: f64,
+}
+
+impl ClusterEstimate {
+    /// The model for `estimate`, whose time per step is that of one rank with its share, and a network
+    /// of this many bytes per second.
+    ///
+    /// Each rank sends a slice of its gradient to each other rank, and then the sum of its own slice.
+    pub fn new(estimate: &DurationEstimate, floats: u64, ranks: usize, bandwidth: f64) -> Self {
+        let others = (ranks - 1) as f64;
+        let bytes = 2.0 * others / ranks as f64 * (floats * 4) as f64;
+        ClusterEstimate {
+            ranks,
+            compute: estimate.step,
+            exchange: 2.0 * others * LATENCY + bytes / bandwidth,
+            bytes,
+        }
+    }
+
+    /// Seconds of a step.
+    pub fn step(&self) -> f64 {
+        self.compute + self.exchange
     }
 }
 
@@ -102,19 +158,21 @@ fn patch_time(one: f64, patches: usize, time: f64) -> f64 {
     }
 }
 
-/// Refuses a configuration whose steps need clearly more than the available memory.
+/// Refuses a configuration whose steps need clearly more than the available memory, which `processes`
+/// processes share.
 ///
 /// `device` has no autodiff. On a device other than the CPU, the memory is unknown and not checked.
 ///
 /// # Errors
 /// The step does not fit, even if the estimate is a third too large.
-pub fn check_memory(config: &Config, device: &Device) -> anyhow::Result<()> {
+pub fn check_memory(config: &Config, device: &Device, processes: usize) -> anyhow::Result<()> {
     if *device != Device::flex() {
         return Ok(());
     }
     let Some(available) = memory::available() else {
         return Ok(());
     };
+    let available = available / processes as u64;
     let needed = step_bytes(config);
     let batch = config.data.batch_size;
     ensure!(
@@ -150,6 +208,19 @@ impl fmt::Display for DurationEstimate {
 }
 
 /// `3 days 4 h`, `2 h 5 min`, `3 min 20 s`, `4.2 s`, `250 ms`: at most two units.
+impl fmt::Display for ClusterEstimate {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "model of {} ranks, one per node like this one: {} per step, {:.0} % of it exchange; each rank sends {:.1} MB",
+            self.ranks,
+            human(self.step()),
+            100.0 * self.exchange / self.step(),
+            self.bytes / 1e6
+        )
+    }
+}
+
 fn human(duration: f64) -> String {
     let seconds = duration as u64;
     let (days, hours, minutes) = (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60);

@@ -10,11 +10,12 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use burn::tensor::Device;
+use demc_data::Batch;
 use demc_data::file::write_whole;
-use demc_data::{Batch, BatchLoader};
 
 use crate::config::Config;
-use crate::run::data::RunData;
+use crate::ranks::Ranks;
+use crate::run::data::{RunData, rank_loader};
 use crate::run::initial::{InitialNetwork, initial_network};
 use crate::step::optimizer::Optimizer;
 use crate::step::trainer::Trainer;
@@ -81,26 +82,29 @@ pub fn sweep(
     data: &RunData,
     range: RateRange,
     device: &Device,
+    ranks: &Ranks,
     mut on_step: impl FnMut(&SweepPoint),
 ) -> anyhow::Result<Sweep> {
-    check_memory(config, device)?;
-    let source = Arc::new(data.patch_source(config)?);
-    let mut loader = BatchLoader::new(source, 0);
+    check_memory(config, device, ranks.on_node().count)?;
+    let source = Arc::new(data.patch_source(config, ranks.on_node())?);
+    let per_step = config.train.grad_accumulation;
+    let mut loader = rank_loader(source, ranks, per_step, 0);
+    let own = ranks.share(per_step);
     let device = device.clone().autodiff();
     let trainer = || -> anyhow::Result<Trainer> {
         let InitialNetwork { model, .. } =
             initial_network(config, data.normalizer.flat_color, &device)?;
         let optimizer = Optimizer::new(config);
-        Ok(Trainer::new(config, model, optimizer, None, device.clone()))
+        let trainer = Trainer::new(config, model, optimizer, None, device.clone());
+        Ok(trainer.on(ranks.clone()))
     };
     let (mut trained, untrained) = (trainer()?, trainer()?);
     let mut ratios = SweepRatios::default();
     for step in 0..range.steps {
-        let batches: Result<Vec<Batch>, demc_data::Error> = (0..config.train.grad_accumulation)
-            .map(|_| loader.next())
-            .collect();
-        let batches = batches?;
-        let before = untrained.mean_loss(batches.iter().cloned());
+        let batches: Result<Vec<Batch>, demc_data::Error> =
+            own.clone().map(|_| loader.next()).collect();
+        let batches = ranks.agree(batches.map_err(Into::into))?;
+        let before = untrained.mean_loss(batches.iter().cloned())?;
         let lr = range.rate(step);
         let mut next = batches.into_iter();
         let report = trained.step(lr, || {

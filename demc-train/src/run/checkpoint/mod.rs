@@ -186,6 +186,14 @@ pub fn save(
     CheckpointStore::new(run).write(state.step, &files, linked, retention)
 }
 
+/// Which checkpoints a run of `config` keeps.
+pub fn retention(config: &Config) -> CheckpointRetention {
+    CheckpointRetention {
+        newest: config.run.keep,
+        every: config.run.keep_every,
+    }
+}
+
 /// Reads a checkpoint onto `device`.
 ///
 /// # Errors

@@ -135,6 +135,16 @@ impl CheckpointStore {
         Ok(names.filter(|name| step_of(name).is_some()).collect())
     }
 
+    /// Removes what a killed run left: unfinished checkpoints, and those that `retention` does not
+    /// keep beside `newest`.
+    ///
+    /// # Errors
+    /// A checkpoint that cannot be removed.
+    pub fn remove_old(&self, newest: &Path, retention: CheckpointRetention) -> anyhow::Result<()> {
+        let name = newest.file_name().and_then(|name| name.to_str());
+        self.prune(name.unwrap_or_default(), retention)
+    }
+
     /// Removes unfinished checkpoints and those that `retention` does not keep, but never `name`.
     fn prune(&self, name: &str, retention: CheckpointRetention) -> anyhow::Result<()> {
         let all = self.all();
@@ -282,6 +292,20 @@ mod tests {
         );
         let latest = fs::read_to_string(dir.path().join(LATEST)).unwrap();
         assert_eq!(latest, "step-00000010\n");
+    }
+
+    #[test]
+    fn what_a_killed_run_left_is_removed() {
+        let all = CheckpointRetention {
+            newest: 9,
+            every: None,
+        };
+        let (dir, store) = run(&[1, 2, 3], all);
+        std::fs::create_dir(dir.path().join("checkpoints/step-00000004.tmp")).unwrap();
+        let two = CheckpointRetention { newest: 2, ..all };
+        let newest = dir.path().join("checkpoints/step-00000003");
+        store.remove_old(&newest, two).unwrap();
+        assert_eq!(remaining(&store), ["step-00000002", "step-00000003"]);
     }
 
     #[test]

@@ -1,5 +1,6 @@
 use super::*;
 use crate::config::OptimizerKind;
+use crate::step::gradients::{grad_norm, scaled};
 use burn::optim::{AdamConfig, GradientsParams};
 use rand::SeedableRng;
 

@@ -75,7 +75,8 @@ fn the_output_is_modulated_before_the_loss() {
             .collect(),
         ..plain.clone()
     };
-    let [plain, twice] = [plain, twice].map(|batch| trainer.mean_loss([batch].into_iter()));
+    let mean = |batch: Batch| trainer.mean_loss([batch].into_iter()).expect("one rank");
+    let [plain, twice] = [plain, twice].map(mean);
     assert!(
         plain > 0.0 && (twice / plain - 2.0).abs() < 1e-5,
         "{plain} {twice}"
@@ -131,7 +132,9 @@ fn a_step_on_kernels_updates_weights_in_place() {
     };
     let before = address(&trainer);
     for _ in 0..2 {
-        let Ok(_) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
+        trainer
+            .step(1e-3, || Ok::<_, Infallible>(batch(2, 0)))
+            .expect("no batch fails");
         assert_eq!(address(&trainer), before);
     }
 }
@@ -143,7 +146,9 @@ fn further_terms_add_to_the_loss_and_change_the_step() {
         let mut config = config(2, 1);
         (config.loss.dssim, config.loss.smape) = (dssim, smape);
         let mut trainer = trainer(&config);
-        let Ok(step) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
+        let step = trainer
+            .step(1e-3, || Ok::<_, Infallible>(batch(2, 0)))
+            .expect("no batch fails");
         (step.loss, trainer.model().weights())
     };
     let (plain, weights) = step(0.0, 0.0);
@@ -162,7 +167,7 @@ fn further_terms_add_to_the_loss_and_change_the_step() {
 #[test]
 fn every_patch_reports_its_loss() {
     let step = trainer(&config(2, 2)).step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
-    let Ok(step) = step;
+    let step = step.expect("no batch fails");
     assert_eq!(step.patches.len(), 4);
     let mean = step.patches.iter().map(|(_, loss)| loss).sum::<f64>() / 4.0;
     assert_eq!(mean, step.loss);
@@ -176,7 +181,9 @@ fn a_non_finite_step_is_skipped() {
     config.model.variant = demc_model::Variant::Demc;
     config.train.ema_decay = Some(0.9);
     let mut trainer = trainer(&config);
-    let Ok(_) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
+    trainer
+        .step(1e-3, || Ok::<_, Infallible>(batch(2, 0)))
+        .expect("no batch fails");
     let state = |trainer: &Trainer| {
         let average = trainer.average().expect("an average").weights();
         (
@@ -190,13 +197,17 @@ fn a_non_finite_step_is_skipped() {
     assert!(specs.iter().any(|spec| !spec.role.is_trainable()));
     let mut bad = batch(2, 0);
     bad.features_z[40] = f32::NAN;
-    let Ok(step) = trainer.step(1e-3, || Ok::<_, Infallible>(bad.clone()));
+    let step = trainer
+        .step(1e-3, || Ok::<_, Infallible>(bad.clone()))
+        .expect("no batch fails");
     assert!(!step.is_finite());
     let unfinished: Vec<bool> = step.patches.iter().map(|(_, l)| l.is_finite()).collect();
     assert_eq!(unfinished, [false, false], "batch normalisation spreads it");
     assert!(state(&trainer) == before);
     assert_eq!(trainer.optimizer().steps(), 1);
-    let Ok(step) = trainer.step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
+    let step = trainer
+        .step(1e-3, || Ok::<_, Infallible>(batch(2, 0)))
+        .expect("no batch fails");
     assert!(step.is_finite() && state(&trainer) != before);
 }
 
@@ -208,7 +219,9 @@ fn the_result_is_the_average() {
     let mut averaged = trainer(&config);
     for trainer in [&mut plain, &mut averaged] {
         for _ in 0..3 {
-            let Ok(_) = trainer.step(1e-2, || Ok::<_, Infallible>(batch(2, 0)));
+            trainer
+                .step(1e-2, || Ok::<_, Infallible>(batch(2, 0)))
+                .expect("no batch fails");
         }
     }
     assert!(plain.model().weights() == averaged.model().weights());
@@ -228,10 +241,14 @@ fn dormant_channels_are_counted_once_they_can_be_known() {
     let optimizer = Optimizer::new(&config);
     let mut trainer = Trainer::new(&config, model.unwrap(), optimizer, None, device);
     for _ in 1..DORMANT_STEPS {
-        let Ok(_) = trainer.step(1e-4, || Ok::<_, Infallible>(batch(2, 0)));
+        trainer
+            .step(1e-4, || Ok::<_, Infallible>(batch(2, 0)))
+            .expect("no batch fails");
     }
     assert_eq!(trainer.dormant(), None);
-    let Ok(_) = trainer.step(1e-4, || Ok::<_, Infallible>(batch(2, 0)));
+    trainer
+        .step(1e-4, || Ok::<_, Infallible>(batch(2, 0)))
+        .expect("no batch fails");
     let found = trainer.dormant().expect("late enough");
     let biases = trainer.optimizer().specs().iter();
     let biases = biases.filter(|spec| spec.name.ends_with(".bias"));

@@ -13,6 +13,7 @@
 
 use std::path::{Path, PathBuf};
 
+use demc_data::file::{MAX_CONFIGURATION, read_text};
 use demc_model::ModelConfig;
 use serde::Deserialize;
 
@@ -86,7 +87,7 @@ impl AblationSpec {
     /// An invalid file or configuration; equal names or invalid directory names; no seeds or equal
     /// seeds; fewer than two variants.
     pub fn load(path: &Path, sets: &[String]) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read {
+        let text = read_text(path, MAX_CONFIGURATION).map_err(|source| ConfigError::Read {
             path: path.into(),
             source,
         })?;

@@ -1,0 +1,117 @@
+#!/usr/bin/env python3
+"""Compares models with Open Image Denoise (OIDN): the table of the model card.
+
+    pip install numpy OpenEXR pyoidn
+    python3 benches/quality.py --data public=data/renders --data held-out=data/heldout --model quality=quality.safetensors
+
+Each row is one program on the test scenes of one data set with one number of samples per pixel. A ratio
+or difference compares with the better of OIDN (quality high) with albedo and normal, plain and denoised
+first, per column. Intervals are 95 % bootstrap intervals over scenes. The images of OIDN and the scores
+are kept in --work.
+"""
+import argparse
+import json
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+PEERS = ("oidn", "oidn-prefilter", "oidn-fast", "oidn-fast-prefilter")
+BEST_OF = PEERS[:2]
+DRAWS = 10_000
+COLUMNS = {
+    # Name: (value of a program from its scenes, whether the comparison is a ratio, whether less is better)
+    "RelMSE": (lambda scores: scores["relmse"].mean(-1), True, True),
+    "geometric mean": (lambda scores: np.exp(np.log(scores["relmse"]).mean(-1)), True, True),
+    "SSIM": (lambda scores: scores["ssim"].mean(-1), False, False),
+    "FLIP": (lambda scores: scores["flip"].mean(-1), True, True),
+    "energy bias, absolute": (lambda scores: np.abs(scores["energy-bias"]).mean(-1), False, True),
+}
+METRICS = ("relmse", "ssim", "flip", "energy-bias")
+
+
+def pair(text: str) -> tuple[str, pathlib.Path]:
+    name, equals, path = text.partition("=")
+    if not (name and equals and path):
+        raise argparse.ArgumentTypeError("expected NAME=PATH")
+    return name, pathlib.Path(path)
+
+
+def run(*command: object) -> None:
+    subprocess.run([str(part) for part in command], check=True, stdout=subprocess.DEVNULL)
+
+
+def scores_of(data: pathlib.Path, model: tuple[str, pathlib.Path] | None, work: pathlib.Path, program: str) -> dict:
+    """`{scene: {program: {metric: value}}}` of a model, the noisy image, and the peers."""
+    name, path = model or ("bundled", None)
+    baselines = []
+    for peer in PEERS:
+        images = work / peer
+        if not (images / "complete").exists():
+            run(sys.executable, ROOT / "python/tools/baselines.py", peer, "--data", data, "-o", images)
+            (images / "complete").touch()
+        baselines += ["--baseline", f"{peer}={images}"]
+    report = work / f"{name}.json"
+    chosen = ["--model", path] if path else []
+    run(program, "evaluate", "--data", data, "--metrics", "flip,energy-bias", "--json", report, *chosen, *baselines)
+    images = json.loads(report.read_text())["images"]
+    return {image["name"]: {"noisy": image["noisy"], name: image["denoised"]} | image["baselines"] for image in images}
+
+
+def groups(data: pathlib.Path) -> dict[int, list[str]]:
+    """The test scenes of each number of samples per pixel."""
+    found: dict[int, list[str]] = {}
+    for scene in json.loads((data / "manifest.json").read_text())["scenes"]:
+        if scene["split"] == "test":
+            found.setdefault(scene["spp"], []).append(scene["name"])
+    return dict(sorted(found.items()))
+
+
+def table(scores: dict, scenes: list[str]) -> list[list[str]]:
+    """Rows of a data set and sample count: program, then a cell per column."""
+    programs = list(scores[scenes[0]])
+    values = {
+        program: {metric: np.array([scores[scene][program][metric] for scene in scenes]) for metric in METRICS} for program in programs
+    }
+    draws = np.random.default_rng(1).integers(len(scenes), size=(DRAWS, len(scenes)))
+    rows = []
+    for program in programs:
+        row = [program]
+        for value, is_ratio, less in COLUMNS.values():
+            own = value(values[program])
+            best = min(BEST_OF, key=lambda peer: float(value(values[peer])) * (1 if less else -1))
+            drawn = [value({metric: array[draws] for metric, array in values[one].items()}) for one in (program, best)]
+            compare = (lambda a, b: a / b) if is_ratio else (lambda a, b: a - b)
+            low, high = np.quantile(compare(*drawn), [0.025, 0.975])
+            form = "{:.3f}" if is_ratio else "{:+.4f}"
+            shown = compare(own, value(values[best]))
+            row.append(f"{own:.4f}: " + " (".join(form.format(part) for part in (shown, low)) + " to " + form.format(high) + ")")
+        rows.append(row)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", action="append", type=pair, required=True, metavar="NAME=DIR", help="data set with test scenes; can be repeated")
+    parser.add_argument("--model", action="append", type=pair, metavar="NAME=FILE", help="exported weights; can be repeated [the bundled model]")
+    parser.add_argument("--work", type=pathlib.Path, default=ROOT / "runs/compared", metavar="DIR", help="OIDN's images and the scores [runs/compared]")
+    parser.add_argument("--program", default=str(ROOT / "target/release/demc-infer"), metavar="FILE", help="demc-infer [target/release/demc-infer]")
+    args = parser.parse_args()
+    for data_name, data in args.data:
+        scores: dict[str, dict] = {}
+        work = args.work / data_name
+        work.mkdir(parents=True, exist_ok=True)
+        for model in args.model or [None]:
+            for scene, programs in scores_of(data, model, work, args.program).items():
+                scores.setdefault(scene, {}).update(programs)
+        for count, scenes in groups(data).items():
+            print(f"\n{data_name}, {count} spp, {len(scenes)} scenes\n")
+            print("| program | " + " | ".join(COLUMNS) + " |\n|---|" + "---:|" * len(COLUMNS))
+            for row in table(scores, scenes):
+                print("| " + " | ".join(row) + " |")
+
+
+if __name__ == "__main__":
+    main()

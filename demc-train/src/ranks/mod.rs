@@ -1,0 +1,425 @@
+//! Ranks: the processes that train one run together.
+//!
+//! A build without the feature `mpi` has one rank and contains nothing of MPI. With it, `mpirun` and
+//! `srun` start the ranks. Each rank computes a contiguous share of a step's micro-batches. Then all
+//! ranks exchange gradients, losses, and statistics, and take the same optimizer step. Everything that
+//! depends on an order is done in the order of the micro-batches, so the number of ranks changes no
+//! bit.
+
+#[cfg(feature = "mpi")]
+mod group;
+#[cfg(not(feature = "mpi"))]
+#[path = "no_group.rs"]
+mod group;
+pub mod tree;
+
+use std::cell::Cell;
+use std::fmt;
+use std::ops::Range;
+use std::rc::Rc;
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use demc_data::message::UsageError;
+use demc_data::output::OutputError;
+use demc_infer::compute::IsaError;
+use demc_infer::device::DeviceError;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+
+use crate::config::ConfigError;
+use group::Group;
+pub use group::{Launch, abort};
+use tree::{Block, PairwiseSum};
+
+/// The ranks of one run. Clones share them.
+#[derive(Clone, Default)]
+pub struct Ranks {
+    /// `None` for a single rank.
+    group: Option<Rc<Group>>,
+    /// Time spent in exchanges, the wait for slower ranks included.
+    spent: Rc<Cell<Duration>>,
+}
+
+/// A rank among those of its node.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct OnNode {
+    /// From 0.
+    pub rank: usize,
+    /// At least 1.
+    pub count: usize,
+}
+
+/// A rank without others on its node.
+const ALONE: OnNode = OnNode { rank: 0, count: 1 };
+
+/// Where a rank runs.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct Place {
+    /// Name of its node.
+    node: String,
+    /// Its threads.
+    threads: usize,
+    /// Its device.
+    device: String,
+}
+
+/// An error that all ranks know of. Rank 0 prints it.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{text}")]
+pub struct SharedError {
+    /// The message, with the rank and the node if not all ranks failed alike.
+    text: String,
+    /// The exit code of the first rank that failed.
+    code: u8,
+}
+
+/// What a rank sends: its value or its error.
+type Sent<T> = Result<T, (String, u8)>;
+
+/// The exit code for an error: 2 for wrong usage or configuration, otherwise 1.
+pub fn exit_code(error: &anyhow::Error) -> u8 {
+    if let Some(shared) = error.downcast_ref::<SharedError>() {
+        return shared.code;
+    }
+    let refused = error.downcast_ref().is_some_and(OutputError::is_usage);
+    let usage = error.is::<ConfigError>()
+        || error.is::<DeviceError>()
+        || error.is::<IsaError>()
+        || error.is::<UsageError>()
+        || refused;
+    if usage { 2 } else { 1 }
+}
+
+impl Ranks {
+    /// All ranks that were started together. Call it on the thread that trains.
+    pub fn world() -> Self {
+        Ranks {
+            group: Group::world().map(Rc::new),
+            ..Self::default()
+        }
+    }
+
+    /// Splits the ranks into groups of `size` and returns this rank's group and its number. The last
+    /// group is smaller if `size` does not divide the number of ranks. Every rank must call it.
+    pub fn split(&self, size: usize) -> (Self, usize) {
+        let number = self.rank() / size;
+        let group = self.group.as_ref().and_then(|group| group.split(number));
+        let part = Ranks {
+            group: group.map(Rc::new),
+            ..Self::default()
+        };
+        (part, number)
+    }
+
+    /// This rank, from 0.
+    pub fn rank(&self) -> usize {
+        self.group.as_ref().map_or(0, |group| group.rank())
+    }
+
+    /// The number of ranks, at least 1.
+    pub fn count(&self) -> usize {
+        self.group.as_ref().map_or(1, |group| group.count())
+    }
+
+    /// This rank among those of its node.
+    pub fn on_node(&self) -> OnNode {
+        self.group.as_ref().map_or(ALONE, |group| group.on_node())
+    }
+
+    /// Whether this rank is rank 0, which alone writes and prints.
+    pub fn is_first(&self) -> bool {
+        self.rank() == 0
+    }
+
+    /// The share of rank `rank` in `items` items: contiguous, and of sizes that differ by at most 1.
+    pub fn share_of(&self, rank: usize, items: usize) -> Range<usize> {
+        let start = |rank: usize| rank * items / self.count();
+        start(rank)..start(rank + 1)
+    }
+
+    /// This rank's share in `items` items.
+    pub fn share(&self, items: usize) -> Range<usize> {
+        self.share_of(self.rank(), items)
+    }
+
+    /// The time spent in exchanges since the last call.
+    pub fn take_time(&self) -> Duration {
+        self.spent.take()
+    }
+
+    /// The values of all ranks, in order. Every rank must call it.
+    ///
+    /// # Errors
+    /// On every rank, if one rank has an error.
+    pub fn gather<T: Serialize + DeserializeOwned>(
+        &self,
+        own: anyhow::Result<T>,
+    ) -> anyhow::Result<Vec<T>> {
+        let Some(group) = &self.group else {
+            return Ok(vec![own?]);
+        };
+        let own: Sent<T> = own.map_err(|error| (format!("{error:#}"), exit_code(&error)));
+        let sent = serde_json::to_vec(&own).context("a message between ranks")?;
+        let received = self.timed(|| group.gather_bytes(&sent));
+        let mut values = Vec::with_capacity(received.len());
+        let mut errors = Vec::new();
+        for (rank, message) in received.iter().enumerate() {
+            let value: Sent<T> =
+                serde_json::from_slice(message).context("a message between ranks")?;
+            match value {
+                Ok(value) => values.push(value),
+                Err((text, code)) => errors.push((rank, text, code)),
+            }
+        }
+        let Some((rank, text, code)) = errors.first().cloned() else {
+            return Ok(values);
+        };
+        let alike = errors.len() == received.len() && errors.iter().all(|other| other.1 == text);
+        let text = match alike {
+            true => text,
+            false => format!("rank {rank} on {}: {text}", group.node(rank)),
+        };
+        Err(SharedError { text, code }.into())
+    }
+
+    /// This rank's value, if no rank has an error. Every rank must call it.
+    ///
+    /// # Errors
+    /// On every rank, if one rank has an error.
+    pub fn agree<T>(&self, own: anyhow::Result<T>) -> anyhow::Result<T> {
+        if self.group.is_none() {
+            return own;
+        }
+        let (value, own) = match own {
+            Ok(value) => (Some(value), Ok(())),
+            Err(error) => (None, Err(error)),
+        };
+        self.gather(own)?;
+        value.context("a rank without an error has a value")
+    }
+
+    /// Rank 0's value on every rank. The others do not call `make`.
+    ///
+    /// # Errors
+    /// On every rank, if rank 0 has an error.
+    pub fn from_first<T: Serialize + DeserializeOwned>(
+        &self,
+        make: impl FnOnce() -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
+        if self.group.is_none() {
+            return make();
+        }
+        let own = self.is_first().then(make).transpose();
+        let first = self.gather(own)?.into_iter().next().flatten();
+        first.context("rank 0 has a value")
+    }
+
+    /// Refuses texts that are not the same on all ranks. `what` names them, such as
+    /// `the configuration`. A single rank does not call `make`.
+    ///
+    /// # Errors
+    /// On every rank: the first rank that differs from rank 0, and the first differing line.
+    pub fn compare(
+        &self,
+        what: &str,
+        make: impl FnOnce() -> anyhow::Result<String>,
+    ) -> anyhow::Result<()> {
+        let Some(group) = &self.group else {
+            return Ok(());
+        };
+        let values = self.gather(make())?;
+        let first = values.first().context("rank 0 has a value")?;
+        let differs = values.iter().position(|value| value != first);
+        let Some(rank) = differs else {
+            return Ok(());
+        };
+        let lines = |text: &str| text.lines().map(str::to_owned).collect::<Vec<_>>();
+        let (ours, theirs) = (lines(first), lines(&values[rank]));
+        let line = (0..ours.len().max(theirs.len()))
+            .find(|line| ours.get(*line) != theirs.get(*line))
+            .unwrap_or(0);
+        let shown = |lines: &[String]| lines.get(line).map_or("nothing", |text| text).to_owned();
+        let text = format!(
+            "{what} of rank {rank} on {} differs from that of rank 0: {} instead of {}",
+            group.node(rank),
+            shown(&theirs),
+            shown(&ours)
+        );
+        Err(SharedError { text, code: 1 }.into())
+    }
+
+    /// Sums vectors over all `terms` terms of all ranks in the order of [`PairwiseSum`]. `blocks` are
+    /// the sums of this rank's share of the terms.
+    ///
+    /// # Shapes
+    /// All sums have the same length, which is that of the result.
+    pub fn sum(&self, blocks: Vec<Block<Vec<f32>>>, terms: usize) -> Option<Vec<f32>> {
+        match &self.group {
+            None => {
+                let mut sum = PairwiseSum::default();
+                blocks.into_iter().for_each(|block| sum.push(block, add));
+                sum.total(add)
+            }
+            Some(group) => self.timed(|| exchanged(self, group, blocks, terms)),
+        }
+    }
+
+    /// One line on all ranks: their number, nodes, threads, devices, and the bytes that each sends for
+    /// a gradient of `floats` values. `None` for a single rank.
+    ///
+    /// # Errors
+    /// A failed exchange.
+    pub fn describe(&self, device: &str, floats: u64) -> anyhow::Result<Option<String>> {
+        let Some(group) = &self.group else {
+            return Ok(None);
+        };
+        let places = self.gather(Ok(Place {
+            node: group.node(group.rank()),
+            threads: demc_data::parallel::threads().count,
+            device: device.to_owned(),
+        }))?;
+        Ok(Some(Placement(&places, floats).to_string()))
+    }
+
+    fn timed<T>(&self, exchange: impl FnOnce() -> T) -> T {
+        let started = Instant::now();
+        let result = exchange();
+        self.spent.set(self.spent.get() + started.elapsed());
+        result
+    }
+}
+
+/// Refuses a number of ranks that does not divide the number of micro-batches.
+///
+/// # Errors
+/// The numbers of ranks that would do.
+pub fn check_divides(count: usize, grad_accumulation: usize) -> anyhow::Result<()> {
+    if grad_accumulation.is_multiple_of(count) {
+        return Ok(());
+    }
+    let fits: Vec<String> = (1..=grad_accumulation.min(4096))
+        .filter(|ranks| grad_accumulation.is_multiple_of(*ranks))
+        .map(|ranks| ranks.to_string())
+        .collect();
+    Err(UsageError(format!(
+        "{count} ranks: train.grad_accumulation = {grad_accumulation} must be a multiple of the number of ranks; \
+         start {} ranks, or change the key",
+        fits.join(", ")
+    ))
+    .into())
+}
+
+fn add(mut left: Vec<f32>, right: Vec<f32>) -> Vec<f32> {
+    for (left, right) in left.iter_mut().zip(right) {
+        *left += right;
+    }
+    left
+}
+
+/// Every rank gets a slice of all blocks of all ranks, sums it, and sends its sum to all.
+fn exchanged(
+    ranks: &Ranks,
+    group: &Group,
+    blocks: Vec<Block<Vec<f32>>>,
+    terms: usize,
+) -> Option<Vec<f32>> {
+    let length = blocks.first()?.sum.len();
+    let slices: Vec<Range<usize>> = (0..ranks.count())
+        .map(|rank| ranks.share_of(rank, length))
+        .collect();
+    let own = ranks.share(length);
+    let mut sent = Vec::with_capacity(length * blocks.len());
+    for slice in &slices {
+        for block in &blocks {
+            sent.extend_from_slice(&block.sum[slice.clone()]);
+        }
+    }
+    let shapes: Vec<Vec<Block<()>>> = (0..ranks.count())
+        .map(|rank| tree::blocks_of(ranks.share_of(rank, terms)))
+        .collect();
+    let to: Vec<usize> = slices.iter().map(|s| s.len() * blocks.len()).collect();
+    let from: Vec<usize> = shapes.iter().map(|s| s.len() * own.len()).collect();
+    drop(blocks);
+    let received = group.all_to_all(&sent, &to, &from);
+    let mut sum = PairwiseSum::default();
+    let mut rest = received.as_slice();
+    for shape in shapes.into_iter().flatten() {
+        let (values, after) = rest.split_at(own.len());
+        rest = after;
+        let block = Block {
+            first: shape.first,
+            terms: shape.terms,
+            sum: values.to_vec(),
+        };
+        sum.push(block, add);
+    }
+    let total = sum.total(add)?;
+    let counts: Vec<usize> = slices.iter().map(Range::len).collect();
+    Some(group.gather_floats(&total, &counts))
+}
+
+/// The places of all ranks, and the number of gradient values.
+struct Placement<'a>(&'a [Place], u64);
+
+impl fmt::Display for Placement<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Placement(places, floats) = self;
+        let distinct = |of: fn(&Place) -> String| {
+            let mut texts: Vec<String> = places.iter().map(of).collect();
+            texts.sort();
+            texts.dedup();
+            texts
+        };
+        let nodes = distinct(|place| place.node.clone());
+        let threads = distinct(|place| place.threads.to_string());
+        let devices = distinct(|place| place.device.clone());
+        let count = places.len() as f64;
+        let bytes = 2.0 * (count - 1.0) / count * *floats as f64 * 4.0;
+        write!(
+            f,
+            "{} ranks on {} node(s) ({}), threads per rank: {}, device: {}, each sends {:.1} MB per step",
+            places.len(),
+            nodes.len(),
+            demc_data::message::short_list(&nodes),
+            threads.join(" or "),
+            devices.join(", "),
+            bytes / 1e6
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_rank_has_everything() {
+        let ranks = Ranks::default();
+        assert_eq!((ranks.rank(), ranks.count(), ranks.share(7)), (0, 1, 0..7));
+        assert_eq!(ranks.gather(Ok(3)).expect("its own"), [3]);
+        let block = |first: usize, value: f32| Block {
+            first,
+            terms: 1,
+            sum: vec![value],
+        };
+        let blocks = vec![block(0, 1.0), block(1, 2.0), block(2, 4.0)];
+        assert_eq!(ranks.sum(blocks, 3), Some(vec![7.0]));
+        let error = ranks.agree::<()>(Err(UsageError("no".into()).into()));
+        assert_eq!(exit_code(&error.expect_err("its own")), 2);
+    }
+
+    #[test]
+    fn the_line_names_what_differs() {
+        let place = |node: &str, threads: usize| Place {
+            node: node.into(),
+            threads,
+            device: "flex".into(),
+        };
+        let places = [place("b", 2), place("a", 2), place("b", 4), place("a", 2)];
+        assert_eq!(
+            Placement(&places, 1_000_000).to_string(),
+            "4 ranks on 2 node(s) (a, b), threads per rank: 2 or 4, device: flex, each sends 6.0 MB per step"
+        );
+    }
+}
