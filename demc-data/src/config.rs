@@ -76,6 +76,9 @@ pub struct DataConfig {
     /// back afterwards. From 0.001 to 10; absent: images keep their exposure, as in the paper.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub exposure_level: Option<f32>,
+    /// Whether denoising gives the output the light of the noisy image; off in the paper. Training does
+    /// not see it, validation does.
+    pub restore_light: bool,
     /// Probabilities that a patch lacks a feature buffer; 0 in the paper.
     #[serde(skip_serializing_if = "Dropout::is_off")]
     pub dropout: Dropout,
@@ -105,6 +108,7 @@ impl Default for DataConfig {
             albedo_demodulation_epsilon: None,
             position: PositionSpace::Scene,
             exposure_level: None,
+            restore_light: false,
             dropout: Dropout::default(),
             batch_size: BATCH_SIZE,
             validation: VALIDATION,

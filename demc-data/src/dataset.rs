@@ -12,11 +12,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::channel::Window;
 use crate::frame::{Presence, check_header};
+use crate::message::printable;
 use crate::seed::{RandomStream, generator};
-use crate::{ChannelLayout, Error};
+use crate::{ChannelLayout, Error, file};
 
 /// The manifest format that this version reads and writes.
 pub const FORMAT: &str = "demc-exr 1";
+/// Largest manifest in bytes (ours: a scene takes 150 to 500).
+pub const MAX_MANIFEST: u64 = 1 << 28;
 /// Maximum number of problems in one message; the others are counted.
 const PROBLEMS_LISTED: usize = 8;
 
@@ -40,7 +43,7 @@ impl fmt::Display for Split {
 }
 
 /// One image of a data set, as described by the manifest.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Scene {
     /// Its name, unique in the data set.
     pub name: String,
@@ -123,7 +126,8 @@ impl Dataset {
     /// [`Error::Read`] without a manifest, [`Error::Dataset`] if it is malformed.
     pub fn list(root: &Path) -> Result<Vec<Scene>, Error> {
         let path = root.join("manifest.json");
-        let text = std::fs::read_to_string(&path).map_err(|source| Error::Read { path, source })?;
+        let text = file::read_text(&path, MAX_MANIFEST);
+        let text = text.map_err(|source| Error::Read { path, source })?;
         parse(root, &text).map_err(|problem| unusable(root, vec![problem]))
     }
 
@@ -322,6 +326,8 @@ fn unusable(root: &Path, mut problems: Vec<String>) -> Error {
     if more > 0 {
         problems.push(format!("and {more} more problems"));
     }
+    // Names and paths of the manifest may contain line breaks.
+    let problems = problems.iter().map(|problem| printable(problem)).collect();
     Error::Dataset {
         root: root.to_owned(),
         problems,

@@ -48,6 +48,13 @@ pub enum Error {
         b: String,
         b_window: String,
     },
+    /// A channel that cannot be denoised beside the colour.
+    #[error("{}: channel {channel} is no layer: {detail}", path.display())]
+    Layer {
+        path: PathBuf,
+        channel: String,
+        detail: String,
+    },
     /// Files that cannot be joined.
     #[error("cannot merge: {0}")]
     Merge(String),

@@ -1,17 +1,37 @@
-//! Output files that are complete or absent.
+//! Output files that are complete or absent, and text files of bounded size.
 
 use std::collections::HashSet;
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, TryLockError};
-use std::io::{self, BufWriter, Write};
+use std::hash::{BuildHasher, RandomState};
+use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 use std::time::Duration;
 
 use crate::Error;
 
-/// Age from which a temporary file counts as abandoned on a file system without locks. Ours: no file
-/// takes that long.
+/// Age from which a temporary file of another computer, or on a file system without locks, counts as
+/// abandoned. Ours: no file takes that long.
 const ABANDONED: Duration = Duration::from_secs(24 * 3600);
+
+/// Largest configuration or channel layout in bytes (ours: those of this project have 4 KB).
+pub const MAX_CONFIGURATION: u64 = 1 << 20;
+
+/// The text of a file. Reading stops at `most` bytes, because a device may not end.
+///
+/// # Errors
+/// A file that cannot be read, has more bytes, or is not UTF-8.
+pub fn read_text(path: &Path, most: u64) -> io::Result<String> {
+    let mut text = String::new();
+    let file = File::open(path)?;
+    file.take(most + 1).read_to_string(&mut text)?;
+    if text.len() as u64 > most {
+        let why = format!("more than {most} bytes, the limit; name another file");
+        return Err(io::Error::new(io::ErrorKind::InvalidData, why));
+    }
+    Ok(text)
+}
 
 /// Writes `path` through `fill`: to a temporary name in the same directory, flushed to the disk,
 /// then renamed. Readers of `path` see either the old or the new file. A symbolic link stays, and
@@ -77,7 +97,7 @@ pub(crate) fn check_replaceable(path: &Path) -> io::Result<()> {
 fn create_beside(target: &Path) -> io::Result<(PathBuf, File)> {
     let temporary = temporary_beside(target)?;
     // A process with the same id was killed here.
-    if is_abandoned(&temporary, std::process::id()) {
+    if is_abandoned(&temporary, host(), std::process::id()) {
         fs::remove_file(&temporary)?;
     }
     let mut options = File::options();
@@ -111,35 +131,36 @@ pub fn remove_abandoned(dir: &Path, names: Option<&[OsString]>) {
     let entries = fs::read_dir(if is_current { Path::new(".") } else { dir });
     for entry in entries.into_iter().flatten().flatten() {
         let hidden = entry.file_name();
-        if let Some((stem, process)) = parse_temporary(&hidden)
+        if let Some((stem, host, process)) = parse_temporary(&hidden)
             && stems.as_ref().is_none_or(|stems| stems.contains(stem))
-            && is_abandoned(&entry.path(), process)
+            && is_abandoned(&entry.path(), host, process)
         {
             let _ = fs::remove_file(entry.path());
         }
     }
 }
 
-/// Whether no process writes the temporary file of `process` any more. Writers hold a lock, which
-/// other computers see too on most network file systems.
-fn is_abandoned(temporary: &Path, process: u32) -> bool {
+/// Whether no process writes the temporary file of `process` on `host` any more. Writers hold a
+/// lock, but few network file systems show it to other computers.
+fn is_abandoned(temporary: &Path, host: &str, process: u32) -> bool {
     let Ok(found) = fs::symlink_metadata(temporary) else {
         return false;
     };
-    let other = process != std::process::id();
-    if !found.is_file() || other && Path::new("/proc").join(process.to_string()).exists() {
+    let is_here = host == self::host();
+    let lives =
+        process != std::process::id() && Path::new("/proc").join(process.to_string()).exists();
+    if !found.is_file() || is_here && lives {
         return false;
     }
     let Ok(file) = File::options().write(true).open(temporary) else {
         return false;
     };
+    let age = found.modified().ok().and_then(|at| at.elapsed().ok());
+    let is_old = age.is_some_and(|age| age > ABANDONED);
     match file.try_lock() {
-        Ok(()) => true,
+        Ok(()) => is_here || is_old,
         Err(TryLockError::WouldBlock) => false,
-        Err(TryLockError::Error(_)) => {
-            let age = found.modified().ok().and_then(|at| at.elapsed().ok());
-            age.is_some_and(|age| age > ABANDONED)
-        }
+        Err(TryLockError::Error(_)) => is_old,
     }
 }
 
@@ -180,14 +201,44 @@ pub(crate) fn target_of(path: &Path) -> io::Result<PathBuf> {
     }
 }
 
-/// `DIR/.NAME.PID.tmp` for `DIR/NAME`: hidden, and different for each process.
+/// `DIR/.NAME.HOST-PID.tmp` for `DIR/NAME`: hidden, and different for each process of all computers.
 fn temporary_beside(path: &Path) -> io::Result<PathBuf> {
     let name = path
         .file_name()
         .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path names no file"))?;
+    Ok(path.with_file_name(temporary_name(name, std::process::id())))
+}
+
+/// `.NAME.HOST-PID.tmp`: what `process` of this computer calls the file `name` while it writes it.
+pub fn temporary_name(name: &OsStr, process: u32) -> OsString {
     let mut hidden = hidden_stem(name);
-    hidden.push(format!(".{}.tmp", std::process::id()));
-    Ok(path.with_file_name(hidden))
+    hidden.push(format!(".{}-{process}.tmp", host()));
+    hidden
+}
+
+/// The name of the processes that share their ids with this one: the kernel's boot, and the
+/// container. Elsewhere than on Linux it is random, for this process alone.
+fn host() -> &'static str {
+    static HOST: OnceLock<String> = OnceLock::new();
+    HOST.get_or_init(|| {
+        linux_host().unwrap_or_else(|| format!("{:016x}", RandomState::new().hash_one(())))
+    })
+}
+
+/// The start of the boot's random id, and the number of the process namespace.
+fn linux_host() -> Option<String> {
+    let boot = fs::read_to_string("/proc/sys/kernel/random/boot_id").ok()?;
+    let namespace = fs::read_link("/proc/self/ns/pid").ok()?;
+    let digits = |text: &str| {
+        text.chars()
+            .filter(char::is_ascii_digit)
+            .collect::<String>()
+    };
+    Some(format!(
+        "{}-{}",
+        boot.get(..8)?,
+        digits(namespace.to_str()?)
+    ))
 }
 
 /// `.NAME`.
@@ -197,12 +248,12 @@ fn hidden_stem(name: &OsStr) -> OsString {
     hidden
 }
 
-/// `.NAME` and the process of `.NAME.PID.tmp`.
-fn parse_temporary(hidden: &OsStr) -> Option<(&OsStr, u32)> {
+/// `.NAME`, host and process of `.NAME.HOST-PID.tmp`.
+fn parse_temporary(hidden: &OsStr) -> Option<(&OsStr, &str, u32)> {
     let hidden = Path::new(hidden);
     let with_process = Path::new(hidden.file_stem()?);
-    let process = with_process.extension()?.to_str()?.parse().ok()?;
+    let (host, process) = with_process.extension()?.to_str()?.rsplit_once('-')?;
     let stem = with_process.file_stem()?;
     let is_hidden = stem.as_encoded_bytes().starts_with(b".");
-    (is_hidden && hidden.extension()? == "tmp").then_some((stem, process))
+    (is_hidden && hidden.extension()? == "tmp").then_some((stem, host, process.parse().ok()?))
 }

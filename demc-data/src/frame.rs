@@ -3,6 +3,7 @@
 //! [`Frame`] is `f32`.
 
 mod channels;
+pub mod layers;
 
 use std::io::{Read, Seek};
 use std::path::Path;
@@ -245,22 +246,11 @@ impl FramePlanes {
                 .map(|(i, plane)| plane.repair(size, i < colors))
                 .sum();
         }
-        let mut decoded =
-            names
-                .iter()
-                .copied()
-                .zip(all)
-                .map(|(name, plane)| match plane.non_finite() {
-                    None => Ok(plane),
-                    Some((index, value, count)) => Err(Error::NonFinite {
-                        path: path.to_owned(),
-                        channel: name.to_owned(),
-                        value,
-                        x: index % window.width,
-                        y: index / window.width,
-                        count,
-                    }),
-                });
+        let mut decoded = names
+            .iter()
+            .copied()
+            .zip(all)
+            .map(|(name, plane)| finite(path, name, window.width, plane));
         let mut take = |slots: &[Option<&str>]| -> Result<Vec<Plane>, Error> {
             let zeros = || Ok(Plane::zeros(window.width * window.height));
             slots
@@ -323,6 +313,21 @@ pub fn check_open_header<R: Read + Seek>(
 ) -> Result<Window, Error> {
     let layout = &*layout.in_file(file, None)?;
     FrameChannels::new(file, layout, reference, Presence::IfPresent)?.window(file.path(), file)
+}
+
+/// The plane, if no sample is NaN or infinite.
+fn finite(path: &Path, name: &str, width: usize, plane: Plane) -> Result<Plane, Error> {
+    match plane.non_finite() {
+        None => Ok(plane),
+        Some((index, value, count)) => Err(Error::NonFinite {
+            path: path.to_owned(),
+            channel: name.to_owned(),
+            value,
+            x: index % width,
+            y: index / width,
+            count,
+        }),
+    }
 }
 
 /// The samples of all planes. The error is the size of the memory that is missing, in MiB.

@@ -24,6 +24,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::Error;
+use crate::file::{MAX_CONFIGURATION, read_text};
 use crate::message::printable;
 
 pub use detect::{FileLayout, detect};
@@ -150,12 +151,11 @@ impl ChannelLayout {
     pub fn resolve(name: &str) -> Result<Self, Error> {
         let text = match PRESETS.iter().find(|(preset, _)| *preset == name) {
             Some((_, text)) => (*text).to_owned(),
-            None if Path::new(name).is_file() => {
-                std::fs::read_to_string(name).map_err(|source| Error::Read {
+            None if Path::new(name).is_file() => read_text(Path::new(name), MAX_CONFIGURATION)
+                .map_err(|source| Error::Read {
                     path: name.into(),
                     source,
-                })?
-            }
+                })?,
             None => {
                 let presets: Vec<&str> = PRESETS.iter().map(|(preset, _)| *preset).collect();
                 return Err(mistake(

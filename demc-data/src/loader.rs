@@ -28,14 +28,23 @@ struct Worker {
 impl BatchLoader {
     /// Starts `source.workers()` threads; `start` is the number of the first batch.
     pub fn new(source: Arc<PatchSource>, start: u64) -> Self {
+        Self::of_numbers(source, start, |number| number)
+    }
+
+    /// As [`new`](Self::new), for a part of all batches: `number(n)` is the number of the nth of them.
+    pub fn of_numbers(
+        source: Arc<PatchSource>,
+        start: u64,
+        number: impl Fn(u64) -> u64 + Clone + Send + 'static,
+    ) -> Self {
         let stride = source.workers().max(1);
         let worker = |first: u64| {
-            let source = Arc::clone(&source);
+            let (source, number) = (Arc::clone(&source), number.clone());
             let (sender, batches) = sync_channel(AHEAD);
             let thread = thread::spawn(move || {
                 for n in (first..).step_by(stride) {
                     // The receiver is closed when the loader is dropped.
-                    if sender.send(source.batch(n)).is_err() {
+                    if sender.send(source.batch(number(n))).is_err() {
                         break;
                     }
                 }

@@ -5,6 +5,7 @@
 
 use std::fmt::Display;
 use std::io::{self, ErrorKind, Write};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
 
@@ -87,9 +88,20 @@ pub fn json(value: &impl Serialize) -> serde_json::Result<String> {
     Ok(escaped(&text, is_hidden_in_lines, escape))
 }
 
+/// Whether this process prints nothing.
+static SILENT: AtomicBool = AtomicBool::new(false);
+
+/// Makes this process print nothing, or print again. Of several processes with one task, one prints.
+pub fn silence(silent: bool) {
+    SILENT.store(silent, Ordering::Relaxed);
+}
+
 /// Prints a message as one line on standard error. Very long messages are cut. A closed or full
 /// stream is ignored.
 pub fn say(message: impl Display) {
+    if SILENT.load(Ordering::Relaxed) {
+        return;
+    }
     let message = printable(&message.to_string());
     let line = match message.char_indices().nth(LONGEST) {
         Some((end, _)) => {
@@ -123,6 +135,9 @@ pub fn result(text: &str) -> io::Result<()> {
 }
 
 fn write_lines(text: &str) -> io::Result<()> {
+    if SILENT.load(Ordering::Relaxed) {
+        return Ok(());
+    }
     let mut out = io::stdout().lock();
     out.write_all((printable_lines(text) + "\n").as_bytes())?;
     out.flush()

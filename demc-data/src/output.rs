@@ -191,6 +191,7 @@ impl Outputs {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::file::temporary_name;
 
     fn message(result: Result<(), OutputError>) -> String {
         result.expect_err("refused").to_string()
@@ -253,24 +254,34 @@ mod tests {
 
     #[test]
     fn leftovers_of_dead_processes_are_removed() {
+        const DAY: std::time::Duration = std::time::Duration::from_secs(24 * 3600);
         let dir = tempfile::tempdir().expect("a directory");
+        let here = |name: &str, process| dir.path().join(temporary_name(name.as_ref(), process));
         // Above the largest process id.
-        let stale = dir.path().join(".out.exr.4199999999.tmp");
-        let other = dir.path().join(".other.exr.4199999999.tmp");
-        let living = dir.path().join(".out.exr.1.tmp");
-        let locked = dir.path().join(".out.exr.4199999998.tmp");
-        for path in [&stale, &other, &living, &locked] {
+        let stale = here("out.exr", 4_199_999_999);
+        let other = here("other.exr", 4_199_999_999);
+        let living = here("out.exr", 1);
+        let locked = here("out.exr", 4_199_999_998);
+        let elsewhere = dir.path().join(".out.exr.0badc0de-1-4199999999.tmp");
+        let long_ago = dir.path().join(".out.exr.0badc0de-1-1.tmp");
+        for path in [&stale, &other, &living, &locked, &elsewhere, &long_ago] {
             fs::write(path, "half").expect("a file");
         }
         let lock = fs::File::open(&locked).expect("a file");
         lock.lock().expect("a lock");
+        let old = fs::File::options()
+            .write(true)
+            .open(&long_ago)
+            .expect("a file");
+        let before = std::time::SystemTime::now() - 2 * DAY;
+        old.set_modified(before).expect("an old file");
         let mut outputs = Outputs::default();
         outputs
             .claim(&dir.path().join("out.exr"), false)
             .expect("free");
         outputs.prepare(Directories::Expect).expect("writable");
-        assert!(!stale.exists());
-        assert!(other.exists() && locked.exists());
+        assert!(!stale.exists() && !long_ago.exists());
+        assert!(other.exists() && locked.exists() && elsewhere.exists());
         assert_eq!(living.exists(), Path::new("/proc/1").exists());
     }
 }

@@ -23,18 +23,53 @@ pub struct Threads {
     pub note: Option<String>,
 }
 
+/// Processes like this one that share the processors.
+static SHARED_BY: OnceLock<usize> = OnceLock::new();
+
+/// Says how many processes like this one share the processors of this computer. Call it before
+/// [`threads`].
+pub fn share_processors(processes: usize) {
+    SHARED_BY.get_or_init(|| processes.max(1));
+}
+
+/// The processors for this process if `processes` share `online` ones and this one may use
+/// `available`.
+///
+/// A process that may use all of them is not bound to any: it gets its share. One that is bound to
+/// some gets these, but no more than its share.
+fn own_processors(available: usize, online: usize, processes: usize) -> usize {
+    available.min(online / processes).max(1)
+}
+
 /// `RAYON_NUM_THREADS`, at most four per processor; by default the number of processors available
 /// to this process.
 pub fn threads() -> &'static Threads {
     static THREADS: OnceLock<Threads> = OnceLock::new();
     THREADS.get_or_init(|| {
-        let processors = thread::available_parallelism().map_or(1, NonZero::get);
+        let available = thread::available_parallelism().map_or(1, NonZero::get);
+        let processors = match SHARED_BY.get() {
+            None | Some(1) => available,
+            Some(processes) => {
+                let online = online_processors().unwrap_or(available);
+                own_processors(available, online, *processes)
+            }
+        };
         let variable = env::var_os(LIMIT);
         limited(
             variable.map(|value| value.to_string_lossy().into_owned()),
             processors,
         )
     })
+}
+
+/// The processors of this computer, where Linux tells.
+fn online_processors() -> Option<usize> {
+    let status = std::fs::read_to_string("/sys/devices/system/cpu/online").ok()?;
+    let counts = status.trim().split(',').map(|range| {
+        let (first, last) = range.split_once('-').unwrap_or((range, range));
+        Some(last.parse::<usize>().ok()? + 1 - first.parse::<usize>().ok()?)
+    });
+    counts.sum()
 }
 
 /// Reads the variable. As in rayon, 0 is the default.
@@ -131,6 +166,16 @@ mod tests {
                 note: None
             }
         );
+    }
+
+    #[test]
+    fn processes_share_the_processors() {
+        // Not bound; bound to one core each; bound to one of two sockets; more processes than cores.
+        assert_eq!(own_processors(16, 16, 4), 4);
+        assert_eq!(own_processors(1, 16, 4), 1);
+        assert_eq!(own_processors(8, 16, 8), 2);
+        assert_eq!(own_processors(2, 2, 4), 1);
+        assert!(online_processors().is_none_or(|count| count >= 1));
     }
 
     #[test]

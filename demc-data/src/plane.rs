@@ -106,6 +106,16 @@ impl Plane {
         }
     }
 
+    /// The smallest sample; infinity for an empty plane.
+    pub fn min(&self) -> f32 {
+        let most = f32::INFINITY;
+        match self {
+            Plane::Half(samples) => samples.iter().map(|x| x.to_f32()).fold(most, f32::min),
+            Plane::Float(samples) => samples.iter().copied().fold(most, f32::min),
+            Plane::Uint(samples) => samples.iter().min().map_or(most, |x| *x as f32),
+        }
+    }
+
     /// The first NaN or infinite sample (index and value) and the number of such samples, or
     /// `None`.
     pub fn non_finite(&self) -> Option<(usize, f32, usize)> {

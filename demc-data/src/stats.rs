@@ -2,7 +2,7 @@
 //! scenes. Sums are computed per scene in double precision and merged in the order of the scenes,
 //! so the result does not depend on the number of threads.
 
-use crate::content::suspicious;
+use crate::content::{ContentProblem, suspicious};
 use crate::dataset::size_mismatch;
 use crate::frame::{FEATURES, FramePlanes, Presence, TEXTURES};
 use crate::moments::{ChannelMoments, hit_samples};
@@ -28,8 +28,8 @@ pub struct Statistics {
     pub misses: u64,
     /// Number of negative samples of colour and reference that were set to 0.
     pub clamped: u64,
-    /// Phrases of [`crate::content::suspicious`] by scene, in their order.
-    pub suspicious: Vec<(String, Vec<String>)>,
+    /// What [`suspicious`] finds in each scene, in their order.
+    pub suspicious: Vec<(String, Vec<ContentProblem>)>,
 }
 
 impl Statistics {
@@ -65,6 +65,7 @@ impl Statistics {
             albedo_demodulation_epsilon,
             position,
             exposure_level,
+            restore_light,
             ..
         } = *config;
         let relmse_epsilon = decimal(relmse_epsilon);
@@ -85,6 +86,7 @@ impl Statistics {
                 albedo_demodulation_epsilon,
                 position,
                 exposure_level,
+                restore_light,
                 features: FeatureStats {
                     mean: total.features.map(|moments| moments.mean as f32),
                     std: total
@@ -114,7 +116,7 @@ struct SceneSums {
     misses: u64,
     clamped: u64,
     /// Of a single scene; empty in a total.
-    suspicious: Vec<String>,
+    suspicious: Vec<ContentProblem>,
 }
 
 impl SceneSums {

@@ -51,6 +51,9 @@ pub struct Normalizer {
     /// output is scaled back. `None`: images keep theirs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub exposure_level: Option<f32>,
+    /// Whether the output gets the light of the noisy image back.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub restore_light: bool,
     /// Mean and standard deviation for the Z-score.
     pub features: FeatureStats,
     /// The flat output with the least RelMSE (Eq. 5) against the training references, in gamma
@@ -196,6 +199,7 @@ mod tests {
             albedo_demodulation_epsilon: None,
             position: PositionSpace::Scene,
             exposure_level: None,
+            restore_light: false,
             features,
             flat_color: [0.4; 3],
         }

@@ -6,7 +6,7 @@ mod support;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use demc_data::{ChannelLayout, Compression, read_frame};
+use demc_data::{ChannelLayout, Compression, Dataset, read_frame};
 use exr::math::RoundingMode;
 use exr::meta::attribute::{LevelMode, SampleType};
 use support::files::{header, scene_kinds, tiled, write_file};
@@ -107,5 +107,23 @@ fn every_finding_in_a_layout_is_valid_or_gives_one_error_line() {
             let message = error.to_string();
             assert!(!message.contains('\n'), "{}: {message}", path.display());
         }
+    }
+}
+
+#[test]
+fn every_seed_of_a_manifest_opens() {
+    let dir = tempfile::tempdir().expect("directory");
+    fs::create_dir(dir.path().join("sub")).expect("writable");
+    let mut images = inputs("seeds/exr").into_iter();
+    let image = images.find(|path| path.ends_with("none.exr"));
+    let image = image.expect("a seed");
+    for name in ["a.exr", "b.exr", "sub/c.exr"] {
+        fs::copy(&image, dir.path().join(name)).expect("copied");
+    }
+    for seed in inputs("seeds/manifest") {
+        fs::copy(&seed, dir.path().join("manifest.json")).expect("copied");
+        let set = Dataset::open(dir.path(), &layout());
+        let set = set.unwrap_or_else(|error| panic!("{}: {error}", seed.display()));
+        assert_eq!(set.scenes.len(), 3, "{}", seed.display());
     }
 }

@@ -80,6 +80,15 @@ pub enum Head {
 }
 
 impl Head {
+    /// The name in configurations.
+    pub fn name(self) -> &'static str {
+        match self {
+            Head::Grey => "grey",
+            Head::Xavier => "xavier",
+            Head::Kernel => "kernel",
+        }
+    }
+
     /// Whether two heads have the same weights; they may differ in the initialisation.
     pub fn has_weights_of(self, other: Head) -> bool {
         (self == Head::Kernel) == (other == Head::Kernel)

@@ -60,15 +60,21 @@ impl Decoder {
         })
     }
 
-    /// Decodes a latent to an image.
+    /// Decodes a latent to an image. A kernel head filters `layers` with the same kernels.
     ///
     /// `skips` has one list per level from the deepest up, with one entry per encoder.
     ///
     /// # Shapes
     /// Latent `[B, K_5, H / 32, W / 32]`, skips of level k `[B, K, H / 2^(4 - k), W / 2^(4 - k)]`,
     /// the noisy colour in gamma space `[B, 3, H, W]`, to `[B, 3, H, W]` in gamma space, not
-    /// negative.
-    pub fn forward(&self, latent: Maps, skips: Vec<Vec<Maps>>, color_gamma: Maps) -> Maps {
+    /// negative. Layers in linear light `[L, 3, H, W]`, for B = 1, to the same.
+    pub fn forward(
+        &self,
+        latent: Maps,
+        skips: Vec<Vec<Maps>>,
+        color_gamma: Maps,
+        layers: Option<Maps>,
+    ) -> (Maps, Option<Maps>) {
         let mut x = latent;
         let mut decoded = Vec::new();
         for (level, skips) in self.levels.iter().zip(skips) {
@@ -78,8 +84,8 @@ impl Decoder {
             }
         }
         match &self.head {
-            Some(head) => x.conv3x3(head, Activation::Relu),
-            None => kernel_head::forward(&self.kernels, decoded, color_gamma),
+            Some(head) => (x.conv3x3(head, Activation::Relu), None),
+            None => kernel_head::forward(&self.kernels, decoded, color_gamma, layers),
         }
     }
 }

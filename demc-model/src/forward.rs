@@ -22,10 +22,48 @@ impl Denoiser {
     /// # Panics
     /// If the tensors have other shapes.
     pub fn forward(&self, color_gamma: Tensor<4>, features_z: Tensor<4>) -> Tensor<4> {
+        self.run(color_gamma, features_z, None).0
+    }
+
+    /// As [`forward`](Self::forward), for one image without autodiff. The kernels of a kernel head
+    /// also filter `layers`, which are divided by the albedo as the colour is, but stay linear.
+    ///
+    /// # Shapes
+    /// `color_gamma` `[1, 3, H, W]`, `features_z` `[1, 12, H, W]`, `layers` `[L, 3, H, W]` in linear
+    /// light, of either sign. Returns the denoised `color_gamma` and `layers`.
+    ///
+    /// # Panics
+    /// If the tensors have other shapes, or the network has no kernel head.
+    pub fn forward_with_layers(
+        &self,
+        color_gamma: Tensor<4>,
+        features_z: Tensor<4>,
+        layers: Tensor<4>,
+    ) -> (Tensor<4>, Tensor<4>) {
+        assert!(self.decoder.head.is_none(), "layers need a kernel head");
+        let [batch, colors, height, width] = color_gamma.dims();
+        let [count, ..] = layers.dims();
+        assert!(batch == 1 && count > 0, "layers of one image");
+        assert_eq!(
+            layers.dims(),
+            [count, colors, height, width],
+            "layers have the channels and the size of color_gamma"
+        );
+        let (color, layers) = self.run(color_gamma, features_z, Some(layers));
+        (color, layers.expect("a kernel head filters layers"))
+    }
+
+    fn run(
+        &self,
+        color_gamma: Tensor<4>,
+        features_z: Tensor<4>,
+        layers: Option<Tensor<4>>,
+    ) -> (Tensor<4>, Option<Tensor<4>>) {
         assert_shapes(color_gamma.dims(), features_z.dims());
         if self.infers_on(&color_gamma.device()) {
-            return inference::forward(self, color_gamma, features_z);
+            return inference::forward(self, color_gamma, features_z, layers);
         }
+        let layers = layers.map(|layers| Maps::from_nchw(layers, self.ops()));
         let color_gamma = Maps::from_nchw(color_gamma, self.ops());
         let features_z = Maps::from_nchw(features_z, self.ops());
         let fusion = self.fusion.as_ref();
@@ -48,13 +86,13 @@ impl Denoiser {
             .last_mut()
             .and_then(|last| last.bottom.take())
             .expect("the last encoder feeds the latent");
-        self.decoder
-            .forward(
-                self.latent.forward(bottom),
-                skips_by_level(encoded),
-                color_gamma,
-            )
-            .into_nchw()
+        let (color, layers) = self.decoder.forward(
+            self.latent.forward(bottom),
+            skips_by_level(encoded),
+            color_gamma,
+            layers,
+        );
+        (color.into_nchw(), layers.map(Maps::into_nchw))
     }
 
     /// The detail map (Fig. 2 e) of Z-scored features, or `None` for a variant without fusion.

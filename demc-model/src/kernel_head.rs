@@ -9,7 +9,9 @@
 //! - `o_3 = y_3`, `o_l = y_l + b_l U(o_(l+1) - D(y_l))`, D the 2x2 mean, U the bilinear doubling.
 //! - The output is `o_0` in gamma space, where it is above [`DARKEST`], else 0.
 //!
-//! For given features, `o_0` is linear in `x_0`: a flat image stays flat, and brightness is kept.
+//! For given kernels, `o_0` is linear in `x_0`: a flat image stays flat, and brightness is kept. So the
+//! kernels filter other images of the same view, too ([`crate::Denoiser::forward_with_layers`]): where
+//! layers add up to the colour, the denoised ones add up to `o_0`.
 
 use burn::nn::conv::Conv2d;
 
@@ -47,12 +49,24 @@ pub(crate) fn build(
     })
 }
 
-/// The denoised image.
+/// The denoised image, and the layers filtered with its kernels.
 ///
 /// # Shapes
 /// `decoded`: the decoder's maps, deepest first. Colour in gamma space `[B, 3, H, W]`, to the same.
-pub(crate) fn forward(kernels: &[Conv2d], decoded: Vec<Maps>, color_gamma: Maps) -> Maps {
-    let mut scales = vec![color_gamma.radiance(GAMMA)];
+/// Layers in linear light `[L, 3, H, W]`, for B = 1, to the same.
+pub(crate) fn forward(
+    kernels: &[Conv2d],
+    decoded: Vec<Maps>,
+    color_gamma: Maps,
+    layers: Option<Maps>,
+) -> (Maps, Option<Maps>) {
+    let has_layers = layers.is_some();
+    let images = color_gamma.radiance(GAMMA);
+    let images = match layers {
+        None => images,
+        Some(layers) => Maps::cat_images(vec![images, layers]),
+    };
+    let mut scales = vec![images];
     for _ in 1..KERNEL_LEVELS {
         scales.push(scales[scales.len() - 1].clone().halve());
     }
@@ -65,5 +79,13 @@ pub(crate) fn forward(kernels: &[Conv2d], decoded: Vec<Maps>, color_gamma: Maps)
             Some(coarse) => filtered.blend(coarse),
         });
     }
-    out.expect("a kernel head has levels").gamma(GAMMA, DARKEST)
+    let out = out.expect("a kernel head has levels");
+    let (color, layers) = match has_layers {
+        false => (out, None),
+        true => {
+            let (color, layers) = out.split_first();
+            (color, Some(layers))
+        }
+    };
+    (color.gamma(GAMMA, DARKEST), layers)
 }

@@ -37,22 +37,24 @@ fn check() {
     let device = Device::flex();
     // In the order of their sizes: only the process's peak so far is known.
     let cases = [
-        (Variant::Demc, Reading::Paper, 24, PAPER, [512, 512]),
-        (Variant::DemcNosn, Reading::Paper, 24, PAPER, [1024, 512]),
-        (Variant::Demc, Reading::Released, 24, PAPER, [768, 1024]),
-        (Variant::Semc, Reading::Paper, 32, PAPER, [736, 1280]),
-        (Variant::Demc, Reading::Paper, 32, PAPER, [1088, 1920]),
+        (Variant::Demc, Reading::Paper, 24, PAPER, [512, 512], 0),
+        (Variant::DemcNosn, Reading::Paper, 24, PAPER, [1024, 512], 0),
+        (Variant::Demc, Reading::Released, 24, PAPER, [768, 1024], 0),
+        (Variant::Semc, Reading::Paper, 32, PAPER, [736, 1280], 0),
+        (Variant::Demc, Reading::Paper, 32, PAPER, [1088, 1920], 0),
         (
             Variant::ColorOnly,
             Reading::Released,
             16,
             EVEN,
             [1536, 2560],
+            0,
         ),
-        (Variant::Demc, Reading::Paper, 32, EVEN, [1088, 1920]),
-        (Variant::Demc, Reading::Paper, 32, STEEP, [1088, 1920]),
+        (Variant::Demc, Reading::Paper, 32, EVEN, [1088, 1920], 0),
+        (Variant::Demc, Reading::Paper, 32, STEEP, [1088, 1920], 0),
+        (Variant::Demc, Reading::Paper, 16, EVEN, [1536, 2560], 9),
     ];
-    for (variant, reading, width, levels, [height, columns]) in cases {
+    for (variant, reading, width, levels, [height, columns], layers) in cases {
         let config = ModelConfig {
             variant,
             reading,
@@ -61,6 +63,7 @@ fn check() {
             // A network for albedo.
             head: match variant {
                 Variant::ColorOnly => Head::Kernel,
+                _ if layers > 0 => Head::Kernel,
                 _ => Head::Grey,
             },
             ..ModelConfig::default()
@@ -69,13 +72,22 @@ fn check() {
         let model = config.init(&mut rng, [0.5; 3], &device);
         let [before, _] = used();
         let image = |channels| Tensor::<4>::ones([1, channels, height, columns], &device);
-        let out = model.forward(image(3), image(12));
+        let out = match layers {
+            0 => model.forward(image(3), image(12)),
+            _ => {
+                let shape = [layers, 3, height, columns];
+                let images = Tensor::<4>::ones(shape, &device);
+                let (out, filtered) = model.forward_with_layers(image(3), image(12), images);
+                assert_eq!(filtered.dims(), shape);
+                out
+            }
+        };
         let [_, peak] = used();
         assert_eq!(out.dims(), [1, 3, height, columns]);
-        let (measured, estimate) = (peak - before, peak_bytes(&config, height, columns));
+        let (measured, estimate) = (peak - before, peak_bytes(&config, height, columns, layers));
         let ratio = estimate as f64 / measured as f64;
         println!(
-            "{config:?} {height}x{columns}: {} MiB estimated, {} MiB measured",
+            "{config:?} {height}x{columns}, {layers} layers: {} MiB estimated, {} MiB measured",
             estimate >> 20,
             measured >> 20
         );

@@ -9,21 +9,10 @@ use demc_data::exr::ExrFile;
 use demc_data::frame::decode_input;
 use demc_data::rewrite::rewrite;
 use demc_data::{ChannelLayout, WriteOptions};
-use demc_fuzz::allow_caught_panics;
+use demc_fuzz::{allow_caught_panics, scratch};
 use libfuzzer_sys::fuzz_target;
 
-/// A directory in memory if available, because every input writes a file.
-static DIR: LazyLock<PathBuf> = LazyLock::new(|| {
-    let memory = Path::new("/dev/shm");
-    let parent = if memory.is_dir() {
-        memory.to_owned()
-    } else {
-        std::env::temp_dir()
-    };
-    let dir = parent.join(format!("demc-fuzz-{}", std::process::id()));
-    std::fs::create_dir_all(&dir).expect("a writable directory");
-    dir
-});
+static DIR: LazyLock<PathBuf> = LazyLock::new(scratch);
 
 fuzz_target!(init: allow_caught_panics(), |bytes: &[u8]| {
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");

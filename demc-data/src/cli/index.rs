@@ -8,7 +8,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
-use demc_data::dataset::FORMAT;
+use demc_data::dataset::{FORMAT, MAX_MANIFEST};
 use demc_data::exr::ExrFile;
 use demc_data::frame::{Presence, check_open_header};
 use demc_data::layout::{MissingPolicies, detect};
@@ -105,7 +105,8 @@ impl Default for Before {
 impl Before {
     fn read(path: &Path) -> Result<Self> {
         let shown = path.display();
-        let text = fs::read_to_string(path).with_context(|| format!("cannot read {shown}"))?;
+        let text =
+            file::read_text(path, MAX_MANIFEST).with_context(|| format!("cannot read {shown}"))?;
         let mut before = Self::default();
         let keys: Map<String, Value> =
             serde_json::from_str(&text).with_context(|| format!("{shown} is not a manifest"))?;

@@ -18,7 +18,7 @@ use crate::{ChannelLayout, Error};
 pub struct WriteOptions {
     /// Channels of the input to keep.
     pub channels: OutputChannels,
-    /// Type of the colour channels; `None`: as in the input (`float` instead of `uint`).
+    /// Type of the channels of colour and layers; `None`: as in the input (`float` instead of `uint`).
     pub precision: Option<SamplePrecision>,
     /// Compression of the parts with colour; `None`: as in the input. If that would change other
     /// channels or cannot be written, [`Compression::Zip`].
@@ -31,7 +31,7 @@ pub enum OutputChannels {
     /// All channels.
     #[default]
     All,
-    /// Only colour, and the alpha channel of the same part (`A` beside `R`, `beauty.A` beside
+    /// Only colour, layers, and the alpha channel of the same part (`A` beside `R`, `beauty.A` beside
     /// `beauty.R`).
     Color,
 }
@@ -103,7 +103,7 @@ pub(super) struct PlannedPart {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ChannelOrigin {
     pub(super) index: usize,
-    /// The plane of the denoised colour that replaces it.
+    /// The plane of denoised values that replaces it.
     pub(super) plane: Option<usize>,
 }
 
@@ -111,11 +111,13 @@ impl RewritePlan {
     pub(super) fn new<R: Read + Seek>(
         file: &ExrFile<R>,
         layout: &ChannelLayout,
+        layers: &[String],
         samples: usize,
         options: &WriteOptions,
     ) -> Result<Self, Error> {
         let layout = layout.in_file(file, None)?;
-        let color = color_channels(file, &layout, samples)?;
+        let replaced = replaced_channels(file, &layout, layers, samples)?;
+        let color = &replaced[..3];
         let mut plan = Self {
             headers: Headers::new(),
             parts: Vec::new(),
@@ -124,7 +126,7 @@ impl RewritePlan {
         for (input, header) in file.source.meta.headers.iter().enumerate() {
             let channels = file.channels().iter().filter(|c| c.part == input);
             let origins: Vec<ChannelOrigin> = channels
-                .filter_map(|channel| origin(channel, &color, options.channels))
+                .filter_map(|channel| origin(channel, &replaced, color, options.channels))
                 .collect();
             if origins.is_empty() {
                 continue;
@@ -141,19 +143,25 @@ impl RewritePlan {
     }
 }
 
-fn color_channels<'a, R: Read + Seek>(
+/// The channels with other values, in the order of their planes: colour, alpha if there is a plane
+/// for it, and the layers.
+fn replaced_channels<'a, R: Read + Seek>(
     file: &'a ExrFile<R>,
     layout: &ChannelLayout,
+    layers: &[String],
     samples: usize,
 ) -> Result<Vec<&'a Channel>, Error> {
-    file.require(&layout.color.each_ref().map(String::as_str))?;
-    let names = layout.color.iter();
-    let mut channels: Vec<&Channel> = names.filter_map(|name| file.channel(name)).collect();
+    let names: Vec<&str> = layout.color.iter().chain(layers).map(|n| &**n).collect();
+    file.require(&names)?;
+    let (color, layers) = names.split_at(layout.color.len());
+    let find = |name: &&str| file.channel(name);
+    let mut channels: Vec<&Channel> = color.iter().filter_map(find).collect();
     let (first, window) = (channels[0], channels[0].window);
-    if samples == 4 * window.width * window.height {
+    if samples == (4 + layers.len()) * window.width * window.height {
         let alpha = layout.alpha.iter();
         channels.extend(alpha.filter_map(|name| file.channel(name)));
     }
+    channels.extend(layers.iter().filter_map(find));
     if let Some(other) = channels.iter().find(|channel| channel.window != window) {
         return Err(Error::Sizes {
             path: file.path().to_owned(),
@@ -171,9 +179,14 @@ fn color_channels<'a, R: Read + Seek>(
 }
 
 /// The source of an output channel; `None` if the channel is dropped.
-fn origin(channel: &Channel, color: &[&Channel], keep: OutputChannels) -> Option<ChannelOrigin> {
+fn origin(
+    channel: &Channel,
+    replaced: &[&Channel],
+    color: &[&Channel],
+    keep: OutputChannels,
+) -> Option<ChannelOrigin> {
     let index = channel.index;
-    let plane = color
+    let plane = replaced
         .iter()
         .position(|c| (c.part, c.index) == (channel.part, index));
     let stays = plane.is_some() || keep == OutputChannels::All || is_alpha(channel, color);

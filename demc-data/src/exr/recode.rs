@@ -27,14 +27,14 @@ use crate::{Error, file};
 /// Headers begin after the magic number and the version, in bytes.
 const HEADERS_START: u64 = 8;
 
-/// Writes the planned file. Returns the number of colour samples beyond the range of half.
+/// Writes the planned file. Returns the number of replaced samples beyond the range of half.
 ///
 /// # Shapes
-/// `color_hdr` is `[3, height, width]`.
+/// `planes` is `[replaced channels, height, width]`.
 pub(super) fn recode<R: Read + Seek>(
     file: &mut ExrFile<R>,
     plan: &RewritePlan,
-    color_hdr: &[f32],
+    planes: &[f32],
     output: &Path,
 ) -> Result<usize, Error> {
     let path = file.path().to_owned();
@@ -45,7 +45,7 @@ pub(super) fn recode<R: Read + Seek>(
             error: None,
         },
         headers: &plan.headers,
-        color_hdr,
+        planes,
         clamped: 0,
     };
     let written = file::write_whole(output, |writer| {
@@ -68,7 +68,7 @@ pub(super) fn recode<R: Read + Seek>(
 struct Recoder<'a, R> {
     input: RewriteInput<'a, R>,
     headers: &'a Headers,
-    color_hdr: &'a [f32],
+    planes: &'a [f32],
     clamped: usize,
 }
 
@@ -131,7 +131,7 @@ impl<R: Read + Seek> Recoder<'_, R> {
         for batch in targets(header)?.chunks(batch) {
             carried.fetch(&mut self.input, batch)?;
             let code = |target: &OutputBlock| -> Result<(usize, Chunk, usize), ExrError> {
-                let (data, clamped) = assemble(header, target, self.color_hdr, &carried);
+                let (data, clamped) = assemble(header, target, self.planes, &carried);
                 let chunk = compress(part, header, target, data)?;
                 Ok((target.index, chunk, clamped))
             };
@@ -166,11 +166,11 @@ pub(super) fn targets(header: &Header) -> Result<Vec<OutputBlock>, ExrError> {
     targets.collect()
 }
 
-/// The samples of an output block, and the number of colour samples beyond the range of half.
+/// The samples of an output block, and the number of replaced samples beyond the range of half.
 fn assemble(
     header: &Header,
     target: &OutputBlock,
-    color_hdr: &[f32],
+    planes: &[f32],
     carried: &CarriedChannels,
 ) -> (Vec<u8>, usize) {
     let Vec2(image_width, image_height) = header.layer_size;
@@ -181,9 +181,9 @@ fn assemble(
         let block = carried.blocks.get(&carried.grid.place(Vec2(x, y)));
         for (channel, content) in header.channels.list.iter().zip(&carried.contents) {
             match content {
-                ChannelContent::Color(plane) => {
+                ChannelContent::Replaced(plane) => {
                     let start = (plane * image_height + y) * image_width + x;
-                    let line = &color_hdr[start..start + width];
+                    let line = &planes[start..start + width];
                     clamped += put(line, channel.sample_type, &mut data);
                 }
                 ChannelContent::Carried(span) => {
@@ -225,7 +225,8 @@ pub(super) fn compress(
 }
 
 enum ChannelContent {
-    Color(usize),
+    /// By this plane.
+    Replaced(usize),
     Carried(SampleSpan),
 }
 
@@ -242,7 +243,7 @@ impl CarriedChannels {
     fn new(part: usize, grid: BlockGrid, input: &Header, origins: &[ChannelOrigin]) -> Self {
         let spans = SampleSpan::all(&input.channels);
         let content = |origin: &ChannelOrigin| match origin.plane {
-            Some(plane) => ChannelContent::Color(plane),
+            Some(plane) => ChannelContent::Replaced(plane),
             None => ChannelContent::Carried(spans[origin.index]),
         };
         Self {

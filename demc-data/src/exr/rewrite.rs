@@ -21,7 +21,7 @@ pub use super::plan::{Change, OutputChannels, WriteOptions};
 /// The result of writing an image.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Written {
-    /// Colour samples beyond the range of half, written as its largest value, 65504.
+    /// Samples of colour and layers beyond the range of half, written as its largest value, 65504.
     pub clamped: usize,
     /// Differences between the layouts of output and input.
     pub changes: Vec<Change>,
@@ -65,8 +65,26 @@ pub fn rewrite<R: Read + Seek>(
     output: &Path,
     options: &WriteOptions,
 ) -> Result<Written, Error> {
-    let plan = RewritePlan::new(file, layout, color_hdr.len(), options)?;
-    let clamped = recode(file, &plan, color_hdr, output)?;
+    rewrite_with_layers(file, layout, &[], color_hdr, output, options)
+}
+
+/// As [`rewrite`], with further channels, `layers`, that have other values.
+///
+/// # Shapes
+/// `planes` are the colour, and alpha if given, as for `rewrite`, then a plane for each layer.
+///
+/// # Errors
+/// As [`rewrite`]; for layers as for the colour's channels.
+pub fn rewrite_with_layers<R: Read + Seek>(
+    file: &mut ExrFile<R>,
+    layout: &ChannelLayout,
+    layers: &[String],
+    planes: &[f32],
+    output: &Path,
+    options: &WriteOptions,
+) -> Result<Written, Error> {
+    let plan = RewritePlan::new(file, layout, layers, planes.len(), options)?;
+    let clamped = recode(file, &plan, planes, output)?;
     Ok(Written {
         clamped,
         changes: plan.changes,

@@ -33,6 +33,7 @@ pub fn identity() -> Normalizer {
         albedo_demodulation_epsilon: None,
         position: PositionSpace::Scene,
         exposure_level: None,
+        restore_light: false,
         features,
         flat_color: [0.4; 3],
     }

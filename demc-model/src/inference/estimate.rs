@@ -32,21 +32,29 @@ const WAITING_ROWS: usize = 5;
 const BURN_VALUES: u64 = 10;
 
 /// Bytes that a pass of `ops` over one image of `height` x `width` pixels takes, without the
-/// network's weights. Both sides are multiples of 32.
-pub fn pass_bytes(ops: Ops, config: &ModelConfig, height: usize, width: usize) -> u64 {
+/// network's weights. Both sides are multiples of 32. `layers` is the number of images of three
+/// channels that a kernel head filters beside the colour.
+pub fn pass_bytes(
+    ops: Ops,
+    config: &ModelConfig,
+    height: usize,
+    width: usize,
+    layers: usize,
+) -> u64 {
     if ops.has_fast_inference() {
-        return peak_bytes(config, height, width);
+        return peak_bytes(config, height, width, layers);
     }
     // The largest map is the fusion sub-network's or a level's; each level has a quarter of the
     // pixels.
     let levels = config.level_channels().into_iter().enumerate();
     let maps = levels.map(|(level, channels)| (channels * height * width) >> (2 * level));
     let largest = maps.fold(config.width * height * width, usize::max);
-    BURN_VALUES * (largest * VALUE) as u64
+    let layers = layers * COLOR_CHANNELS * height * width;
+    BURN_VALUES * ((largest + layers) * VALUE) as u64
 }
 
-/// Peak memory in bytes of a pass of the kernels over one image of `height` x `width` pixels. Both
-/// sides are multiples of 32.
+/// Peak memory in bytes of a pass of the kernels over one image of `height` x `width` pixels, with
+/// `layers` as for [`pass_bytes`]. Both sides are multiples of 32.
 ///
 /// It counts the planar input and output and the working memory of
 /// [`Denoiser::forward`](crate::Denoiser::forward), but not the network's weights.
@@ -56,14 +64,19 @@ pub fn pass_bytes(ops: Ops, config: &ModelConfig, height: usize, width: usize) -
 /// `P` pixels and base width `C` mostly needs the skips' shares of the fusions,
 /// `C * P * (1/2 + 1/4 + 1/8 + 1/32)` values, and the images, `6 * P` to `18 * P` values. Bands,
 /// and so the result, grow a little with the number of threads.
-pub fn peak_bytes(config: &ModelConfig, height: usize, width: usize) -> u64 {
+pub fn peak_bytes(config: &ModelConfig, height: usize, width: usize, layers: usize) -> u64 {
     let plan = BandPlan::new(width);
     let grid = Grid {
         batch: 1,
         height,
         width,
     };
-    let estimate = PeakEstimate { config, plan, grid };
+    let estimate = PeakEstimate {
+        config,
+        plan,
+        grid,
+        layers,
+    };
     let values = estimate.encoders().max(estimate.decoder());
     (values * VALUE) as u64
 }
@@ -78,6 +91,8 @@ struct PeakEstimate<'a> {
     config: &'a ModelConfig,
     plan: BandPlan,
     grid: Grid,
+    /// Images of three channels that the kernel head filters beside the colour.
+    layers: usize,
 }
 
 impl PeakEstimate<'_> {
@@ -150,6 +165,16 @@ impl PeakEstimate<'_> {
             true => self.grid.pixels() * COLOR_CHANNELS,
             false => 0,
         }
+    }
+
+    /// The planes of the layers, until the kernel head has them channels last.
+    fn layers(&self) -> usize {
+        self.grid.pixels() * COLOR_CHANNELS * self.layers
+    }
+
+    /// The images that a kernel head filters.
+    fn filtered_images(&self) -> usize {
+        1 + self.layers
     }
 
     /// The skips' shares of some levels' fusions. For a large image the first level's share is not
@@ -227,7 +252,7 @@ impl PeakEstimate<'_> {
             };
             most = most.max(held + working);
         }
-        most
+        most + self.layers()
     }
 
     fn decoder(&self) -> usize {
@@ -258,7 +283,7 @@ impl PeakEstimate<'_> {
             + 3 * self.rows(0, self.plan.band + 2 * WAITING_ROWS);
         let last = match (is_large, self.config.head) {
             (true, Head::Kernel) => {
-                let filtered = self.grid.pixels() * (COLOR_CHANNELS + 1);
+                let filtered = self.grid.pixels() * (COLOR_CHANNELS + 1) * self.filtered_images();
                 (self.below(0) + self.filter(0)).max(bands + filtered)
             }
             (false, Head::Kernel) => self.map(0) + self.filter(0),
@@ -273,7 +298,10 @@ impl PeakEstimate<'_> {
     fn scales(&self) -> usize {
         let levels = (0..KERNEL_LEVELS).map(|level| self.grid_of(level).pixels());
         match self.config.head {
-            Head::Kernel => levels.map(|pixels| pixels * COLOR_CHANNELS).sum(),
+            Head::Kernel => {
+                let values: usize = levels.map(|pixels| pixels * COLOR_CHANNELS).sum();
+                values * self.filtered_images()
+            }
             Head::Grey | Head::Xavier => 0,
         }
     }
@@ -287,9 +315,10 @@ impl PeakEstimate<'_> {
         let Grid { height, width, .. } = self.grid_of(level);
         let pixels = height * width;
         let logits = self.plan.band.min(height) * width * logits(level);
-        let below = pixels / 4 * COLOR_CHANNELS;
-        let blend = pixels * COLOR_CHANNELS + below;
-        pixels * (COLOR_CHANNELS + 1) + below + logits.max(blend)
+        let images = self.filtered_images();
+        let below = images * pixels / 4 * COLOR_CHANNELS;
+        let blend = images * pixels * COLOR_CHANNELS + below;
+        images * pixels * (COLOR_CHANNELS + 1) + below + logits.max(blend)
     }
 
     fn below(&self, level: usize) -> usize {

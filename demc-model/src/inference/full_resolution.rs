@@ -110,14 +110,14 @@ impl InferencePass<'_> {
         }
     }
 
-    /// The planar output image: the decoder's last level and the output convolution. `below` is the
+    /// The planar output image, and the layers: the decoder's last level and the head. `below` is the
     /// map of the level below; the first level's skips are recomputed from `sources`.
     pub(super) fn decode_full_resolution(
         &self,
         below: &FeatureMaps,
         sources: SkipSources,
         kernel_head: Option<KernelHead>,
-    ) -> Vec<f32> {
+    ) -> (Vec<f32>, Option<Vec<f32>>) {
         let SkipSources { images, detail } = sources;
         let (grid, inputs) = (images.grid, self.inputs_by_encoder());
         let decoder = &self.model.decoder;
@@ -236,9 +236,9 @@ impl OutputRows<'_> {
         }
     }
 
-    fn finish(self) -> Vec<f32> {
+    fn finish(self) -> (Vec<f32>, Option<Vec<f32>>) {
         match self {
-            OutputRows::Convolution { planar, .. } => planar,
+            OutputRows::Convolution { planar, .. } => (planar, None),
             OutputRows::Kernels {
                 mut head, filtered, ..
             } => {

@@ -19,7 +19,8 @@ pub(super) struct InputImages {
     features: Option<FlexTensor>,
 }
 
-fn host(tensor: Tensor<4>) -> FlexTensor {
+/// The contiguous values of a tensor on `flex`.
+pub(super) fn host(tensor: Tensor<4>) -> FlexTensor {
     let tensor = tensor
         .try_into_primitive::<Flex>()
         .expect("an image on flex");

@@ -4,12 +4,14 @@
 use std::ops::Range;
 
 use burn::backend::flex::FlexTensor;
+use burn::tensor::Tensor;
 use demc_kernels::conv1x1::{self, Epilogue};
 use demc_kernels::{Grid, Isa, blend, filter5x5, grid, memory, power};
 use rayon::prelude::*;
 
 use super::band::bands;
 use super::folded::FoldedConv;
+use super::images::host;
 use super::{FeatureMaps, InferencePass};
 use crate::config::COLOR_CHANNELS;
 use crate::denoiser::Denoiser;
@@ -19,19 +21,42 @@ pub(super) struct KernelHead {
     isa: Isa,
     /// The convolutions to logits, from the full resolution down.
     convs: Vec<FoldedConv>,
-    /// The noisy image in linear light, from the full resolution down.
+    /// The noisy images in linear light, from the full resolution down. After a single image come the
+    /// layers that share its kernels.
     scales: Vec<FeatureMaps>,
+    /// Number of layers.
+    layers: usize,
     /// The output of the levels so far.
     out: Option<FeatureMaps>,
 }
 
 impl KernelHead {
-    /// The kernel head of `model` for planar images in gamma space.
-    pub(super) fn new(isa: Isa, model: &Denoiser, grid: Grid, color: &FlexTensor) -> Self {
+    /// The kernel head of `model` for planar images in gamma space, and for layers in linear light,
+    /// `[layers, 3, H, W]`, of a single image.
+    pub(super) fn new(
+        isa: Isa,
+        model: &Denoiser,
+        grid: Grid,
+        color: &FlexTensor,
+        layers: Option<Tensor<4>>,
+    ) -> Self {
         let kernels = model.decoder.kernels.iter().rev();
-        let mut image = FeatureMaps::new(grid, COLOR_CHANNELS);
-        grid::nhwc_from_nchw(grid, color.storage::<f32>(), &mut image.values);
-        power::positive_powers(isa, &mut image.values, GAMMA);
+        let count = layers.as_ref().map_or(0, |layers| layers.dims()[0]);
+        let all = Grid {
+            batch: grid.batch + count,
+            ..grid
+        };
+        let mut image = FeatureMaps::new(all, COLOR_CHANNELS);
+        let (colors, others) = image.values.split_at_mut(grid.pixels() * COLOR_CHANNELS);
+        grid::nhwc_from_nchw(grid, color.storage::<f32>(), colors);
+        power::positive_powers(isa, colors, GAMMA);
+        if let Some(layers) = layers.map(host) {
+            let grid = Grid {
+                batch: count,
+                ..grid
+            };
+            grid::nhwc_from_nchw(grid, layers.storage::<f32>(), others);
+        }
         let mut scales = vec![image];
         for _ in 1..KERNEL_LEVELS {
             let above = &scales[scales.len() - 1];
@@ -43,17 +68,18 @@ impl KernelHead {
             isa,
             convs: kernels.map(|conv| FoldedConv::conv(conv, None)).collect(),
             scales,
+            layers: count,
             out: None,
         }
     }
 
-    /// The image of a level to be filtered into.
+    /// The images of a level to be filtered into.
     pub(super) fn filtered(&self, level: usize) -> FeatureMaps {
         let channels = COLOR_CHANNELS + self.convs[level].outputs() - filter5x5::TAPS;
         FeatureMaps::new(self.scales[level].grid, channels)
     }
 
-    /// Filters some rows of an image; `decoded` are these rows of the decoder's map.
+    /// Filters some rows of an image and its layers; `decoded` are these rows of the decoder's map.
     pub(super) fn filter_rows(
         &self,
         level: usize,
@@ -79,11 +105,14 @@ impl KernelHead {
             epilogue,
             &mut logits,
         );
-        let whole = 0..scale.grid.height;
-        let x = scale.rows(image, whole);
-        let grid = scale.band(scale.grid.height);
-        let target = filtered.rows_mut(image, rows.clone());
-        filter5x5::forward_rows(self.isa, grid, x, rows, &logits, target);
+        let images = image..image + 1 + self.layers;
+        let x = scale.images(images.clone());
+        let grid = Grid {
+            batch: images.len(),
+            ..scale.grid
+        };
+        let targets = filtered.rows_of_images_mut(images, rows.clone());
+        filter5x5::forward_rows(self.isa, grid, x, rows, &logits, targets);
     }
 
     /// Completes a level: blends the filtered image with the output so far.
@@ -99,18 +128,28 @@ impl KernelHead {
         });
     }
 
-    /// The output in gamma space, planar.
-    pub(super) fn finish(self) -> Vec<f32> {
+    /// The output in gamma space and the layers in linear light, planar.
+    pub(super) fn finish(self) -> (Vec<f32>, Option<Vec<f32>>) {
         let mut out = self.out.expect("all levels are filtered");
-        out.values.par_iter_mut().for_each(|value| {
+        drop(self.scales);
+        let batch = out.grid.batch - self.layers;
+        let (colors, layers) = {
+            let image = out.grid.height * out.grid.width * COLOR_CHANNELS;
+            out.values.split_at_mut(batch * image)
+        };
+        colors.par_iter_mut().for_each(|value| {
             if *value <= DARKEST {
                 *value = 0.0;
             }
         });
-        power::positive_powers(self.isa, &mut out.values, 1.0 / GAMMA);
-        let mut planar = memory::buffer(out.values.len());
-        grid::nchw_from_nhwc(out.grid, &out.values, &mut planar);
-        planar
+        power::positive_powers(self.isa, colors, 1.0 / GAMMA);
+        let planar = |batch: usize, values: &[f32]| {
+            let mut planar = memory::buffer(values.len());
+            grid::nchw_from_nhwc(Grid { batch, ..out.grid }, values, &mut planar);
+            planar
+        };
+        let filtered = (self.layers > 0).then(|| planar(self.layers, layers));
+        (planar(batch, colors), filtered)
     }
 }
 

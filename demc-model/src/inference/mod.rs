@@ -60,9 +60,10 @@ pub(crate) fn forward(
     model: &Denoiser,
     color_gamma: Tensor<4>,
     features_z: Tensor<4>,
-) -> Tensor<4> {
+    layers: Option<Tensor<4>>,
+) -> (Tensor<4>, Option<Tensor<4>>) {
     let plan = BandPlan::new(color_gamma.dims()[3]);
-    forward_with(model, color_gamma, features_z, Tile::F4, plan)
+    forward_with(model, color_gamma, features_z, layers, Tile::F4, plan)
 }
 
 /// The same with a given size of tiles and plan.
@@ -70,9 +71,10 @@ fn forward_with(
     model: &Denoiser,
     color_gamma: Tensor<4>,
     features_z: Tensor<4>,
+    layers: Option<Tensor<4>>,
     tile: Tile,
     plan: BandPlan,
-) -> Tensor<4> {
+) -> (Tensor<4>, Option<Tensor<4>>) {
     let [batch, _, height, width] = color_gamma.dims();
     let pass = InferencePass {
         isa: Isa::current(),
@@ -85,10 +87,18 @@ fn forward_with(
     let grid = images.grid;
     let color = model.decoder.head.is_none().then(|| images.color());
     let encoded = pass.encode(images);
-    let head = color.map(|color| KernelHead::new(pass.isa, model, grid, &color));
-    let out = pass.decode(encoded, head);
-    let shape = [batch, COLOR_CHANNELS, height, width];
-    Tensor::from_primitive::<Flex>(FlexTensor::from_data(TensorData::new(out, shape)))
+    let head = color.map(|color| KernelHead::new(pass.isa, model, grid, &color, layers));
+    let (out, layers) = pass.decode(encoded, head);
+    let tensor = |planes: Vec<f32>, images: usize| {
+        let shape = [images, COLOR_CHANNELS, height, width];
+        Tensor::from_primitive::<Flex>(FlexTensor::from_data(TensorData::new(planes, shape)))
+    };
+    let image = COLOR_CHANNELS * height * width;
+    let layers = layers.map(|layers| {
+        let images = layers.len() / image;
+        tensor(layers, images)
+    });
+    (tensor(out, batch), layers)
 }
 
 #[derive(Clone, Copy)]
@@ -161,7 +171,12 @@ impl InferencePass<'_> {
         }
     }
 
-    fn decode(&self, encoded: EncodedImages, mut head: Option<KernelHead>) -> Vec<f32> {
+    /// The planes of the denoised images, and of the layers of a kernel head.
+    fn decode(
+        &self,
+        encoded: EncodedImages,
+        mut head: Option<KernelHead>,
+    ) -> (Vec<f32>, Option<Vec<f32>>) {
         let EncodedImages {
             sums,
             sources,
@@ -184,7 +199,7 @@ impl InferencePass<'_> {
                 let image = self.conv3x3(&x, &FoldedConv::conv(conv_head(decoder), None));
                 let mut planar = memory::buffer(image.values.len());
                 grid::nchw_from_nhwc(image.grid, &image.values, &mut planar);
-                planar
+                (planar, None)
             }
         }
     }
@@ -239,6 +254,22 @@ impl FeatureMaps {
     fn rows_mut(&mut self, image: usize, rows: Range<usize>) -> &mut [f32] {
         let range = self.range(image, rows);
         &mut self.values[range]
+    }
+
+    /// All rows of some images.
+    fn images(&self, images: Range<usize>) -> &[f32] {
+        let image = self.grid.height * self.grid.width * self.channels();
+        &self.values[images.start * image..images.end * image]
+    }
+
+    /// The same rows of each of some images.
+    fn rows_of_images_mut(&mut self, images: Range<usize>, rows: Range<usize>) -> Vec<&mut [f32]> {
+        let row = self.grid.width * self.channels();
+        let all = self.values.chunks_mut(self.grid.height * row);
+        all.skip(images.start)
+            .take(images.len())
+            .map(|values| &mut values[rows.start * row..rows.end * row])
+            .collect()
     }
 
     fn range(&self, image: usize, rows: Range<usize>) -> Range<usize> {

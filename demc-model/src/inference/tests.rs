@@ -51,7 +51,7 @@ fn plan(band: usize) -> BandPlan {
 
 fn run(model: &Denoiser, size: [usize; 3], tile: Tile, band: usize) -> Vec<f32> {
     let [color, features] = images(size);
-    let out = forward_with(model, color, features, tile, plan(band));
+    let (out, _) = forward_with(model, color, features, None, tile, plan(band));
     out.into_data().try_to_vec().expect("float32")
 }
 
@@ -90,6 +90,28 @@ fn bands_give_the_bits_of_whole_maps() {
     });
 }
 
+#[test]
+fn bands_filter_layers_as_whole_maps_do() {
+    let model = initialised(ModelConfig {
+        width: 6,
+        head: Head::Kernel,
+        ..ModelConfig::default()
+    });
+    let run = |band| {
+        let [color, features] = images([1, 160, 32]);
+        let layers = images([2, 160, 32])[0].clone();
+        let (out, layers) =
+            forward_with(&model, color, features, Some(layers), Tile::F4, plan(band));
+        let host =
+            |tensor: Tensor<4>| -> Vec<f32> { tensor.into_data().try_to_vec().expect("float32") };
+        (host(out), host(layers.expect("layers")))
+    };
+    let whole = run(WHOLE);
+    for band in [8, 24, 40] {
+        assert!(run(band) == whole, "{band}");
+    }
+}
+
 /// Share of the largest value. Small tiles are as exact as the plain sum; float32 rounds through 27
 /// layers.
 const TOLERANCE: f32 = 1e-5;
@@ -122,7 +144,7 @@ fn an_image_in_a_batch_has_the_bits_of_the_image_alone() {
     let size = [2, 96, 64];
     let both = run(&model, size, Tile::F4, 8);
     let [color, features] = images(size).map(|images| images.narrow(0, 1, 1));
-    let out = forward_with(&model, color, features, Tile::F4, plan(8));
+    let (out, _) = forward_with(&model, color, features, None, Tile::F4, plan(8));
     let second: Vec<f32> = out.into_data().try_to_vec().expect("float32");
     assert!(both[second.len()..] == second);
 }

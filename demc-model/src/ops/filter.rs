@@ -15,8 +15,9 @@ pub(super) fn halve(x: Tensor<4>) -> Tensor<4> {
     avg_pool2d(x, AvgPoolOptions::new([2, 2]))
 }
 
-/// See [`demc_kernels::filter5x5::forward`].
+/// See [`demc_kernels::filter5x5::forward`]. Several images may share the kernels of one.
 pub(super) fn filter5x5(x: Tensor<4>, logits: Tensor<4>) -> Tensor<4> {
+    let [batch, ..] = x.dims();
     let [_, channels, height, width] = logits.dims();
     let taps = SIDE * SIDE;
     let kernels = activation::softmax(logits.clone().narrow(1, 0, taps), 1);
@@ -27,10 +28,10 @@ pub(super) fn filter5x5(x: Tensor<4>, logits: Tensor<4>) -> Tensor<4> {
     };
     let filtered = (1..taps).fold(tap(0), |sum, i| sum + tap(i));
     match channels > taps {
-        true => Tensor::cat(
-            vec![filtered, activation::sigmoid(logits.narrow(1, taps, 1))],
-            1,
-        ),
+        true => {
+            let weight = activation::sigmoid(logits.narrow(1, taps, 1));
+            Tensor::cat(vec![filtered, weight.expand([batch, 1, height, width])], 1)
+        }
         false => filtered,
     }
 }

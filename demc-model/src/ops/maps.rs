@@ -172,6 +172,7 @@ impl Maps {
 
     /// An image, filtered with a 5x5 kernel per pixel, the softmax of its logits; the border is
     /// replicated. A 26th logit becomes a fourth channel, its sigmoid. The image has no gradient.
+    /// Logits of a single image filter all images, without autodiff.
     ///
     /// # Shapes
     /// `[B, 3, H, W]` and logits `[B, 25, H, W]` or `[B, 26, H, W]` to `[B, 3, H, W]` or
@@ -235,6 +236,29 @@ impl Maps {
             Ops::Burn => max_pool2d(self.tensor, MaxPoolOptions::new([2, 2])),
         };
         Maps { tensor, ..self }
+    }
+
+    /// The first image, and the others.
+    ///
+    /// # Shapes
+    /// `[B, C, H, W]` to `[1, C, H, W]` and `[B - 1, C, H, W]`.
+    pub fn split_first(self) -> (Self, Self) {
+        let [batch, ..] = self.dims();
+        let first = self.tensor.clone().narrow(0, 0, 1);
+        let others = self.tensor.narrow(0, 1, batch - 1);
+        let ops = self.ops;
+        let [first, others] = [first, others].map(|tensor| Maps { tensor, ops });
+        (first, others)
+    }
+
+    /// The images of all parts as one batch.
+    ///
+    /// # Shapes
+    /// `[B_i, C, H, W]` to `[sum of B_i, C, H, W]`.
+    pub fn cat_images(parts: Vec<Maps>) -> Self {
+        let (tensors, ops) = split(parts);
+        let tensor = Tensor::cat(tensors, 0);
+        Maps { tensor, ops }
     }
 
     /// The concatenation of all parts over channels.

@@ -107,10 +107,10 @@ impl KernelOps for Flex {
 
     fn filter5x5(x: FlexTensor, logits: FlexTensor) -> FlexTensor {
         let [x, logits] = [x, logits].map(contiguous);
-        let (grid, channels) = grid(&logits);
-        let mut y = buffer(grid.pixels() * (filter5x5::COLORS + channels - filter5x5::TAPS));
+        let ((images, _), (grid, channels)) = (grid(&x), grid(&logits));
+        let mut y = buffer(images.pixels() * (filter5x5::COLORS + channels - filter5x5::TAPS));
         filter5x5::forward(Isa::current(), grid, values(&x), values(&logits), &mut y);
-        maps(grid, y)
+        maps(images, y)
     }
 
     fn blend(filtered: FlexTensor, coarse: FlexTensor) -> FlexTensor {
