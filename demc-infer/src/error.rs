@@ -3,6 +3,7 @@
 use burn::tensor::TensorReadError;
 use demc_data::exr::{UnsupportedSize, check_size};
 use demc_data::{FEATURES, Frame};
+use demc_model::Head;
 use demc_model::config::COLOR_CHANNELS;
 use demc_model::metrics::ImageError;
 
@@ -34,6 +35,9 @@ pub enum DenoiseError {
     /// The image does not fit into memory.
     #[error("{name}")]
     Memory { name: String, source: TooLarge },
+    /// The layers cannot be filtered.
+    #[error("{name}")]
+    Layers { name: String, source: LayersError },
     /// A feature channel is far from the training data: another unit, or another buffer.
     #[error(
         "{name}: {channel} does not fit the model's statistics: \
@@ -77,6 +81,32 @@ pub enum DenoiseError {
     /// The frame has no reference to compare with.
     #[error("{name}: no reference in the file")]
     NoReference { name: String },
+}
+
+/// Why layers cannot be filtered.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages explain the fields")]
+pub enum LayersError {
+    /// The network makes colours instead of kernels.
+    #[error(
+        "layers need a model with model.head = \"{}\", whose kernels filter them; this one has \"{}\"",
+        Head::Kernel.name(),
+        found.name()
+    )]
+    Head { found: Head },
+    /// Test-time augmentation.
+    #[error(
+        "layers need a single pass, not the mean of {count}: it is taken in gamma space, where \
+         layers do not add up"
+    )]
+    Ensemble { count: usize },
+    /// A layer does not have the frame's size.
+    #[error("layer {name} holds {found} values; the image has {expected} pixels")]
+    Size {
+        name: String,
+        found: usize,
+        expected: usize,
+    },
 }
 
 pub(crate) fn check_sizes(frame: &Frame) -> Result<(), DenoiseError> {

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use demc_data::Frame;
 use demc_model::metrics::DISPLAY_GAMMA;
+use serde::{Deserialize, Serialize};
 
 /// Pixels between two pictures of a strip.
 const GAP: usize = 4;
@@ -15,7 +16,7 @@ const GAP_RGB: [u8; 3] = [255; 3];
 const DETAIL_QUANTILE: f64 = 0.995;
 
 /// An 8-bit RGB picture.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Picture {
     width: usize,
     height: usize,

@@ -144,8 +144,10 @@ fn missing_images_and_other_sizes_are_named_before_anything_is_computed() {
         let path = dir.join(format!("{scene}.exr"));
         write_rgb(&path, 2, 3, &[1.0; 18], SamplePrecision::Half).expect("written");
     }
-    let outcome = demc_infer(list("evaluate")).failure(1, "");
+    let outcome = demc_infer(list("evaluate"));
+    assert_eq!(outcome.code, 1, "{}", outcome.stderr);
     outcome.says("col-dining-room-1.exr: is 2x3, but the scene is ");
+    outcome.says("error: 2 of 4 scenes were not scored\n");
 }
 
 #[test]

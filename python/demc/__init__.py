@@ -1,7 +1,7 @@
 """The DEMC Monte Carlo denoiser (Yang et al. 2019) in PyTorch, and a reader of renderers' EXR files.
 
 It loads and runs the weights that `demc-infer export` writes. Names are imported at first use:
-`read_exr`, `Frame`, and `preprocess` need NumPy and OpenEXR only, the others PyTorch.
+`read_exr`, `Frame`, `preprocess`, and `light` need NumPy and OpenEXR only, the others PyTorch.
 """
 
 from importlib import import_module
@@ -17,6 +17,7 @@ _MODULES = {
     "bundle": ["Bundle", "load"],
     "exr": ["Frame", "read_exr"],
     "layouts": [],
+    "light": [],
     "metrics": ["gamma_from_hdr", "hdr_from_gamma", "rel_mse"],
     "network": ["Denoiser", "ModelConfig"],
     "preprocess": [],

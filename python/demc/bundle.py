@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,11 +19,12 @@ import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
+from torch.nn import functional as F
 
-from . import preprocess
+from . import light, preprocess
 from .metrics import gamma_from_hdr, hdr_from_gamma
 from .network import Denoiser, ModelConfig
-from .preprocess import FEATURES
+from .preprocess import FEATURES, layer_color
 
 FORMAT = 1
 """The bundle format that this package reads."""
@@ -80,10 +82,32 @@ class Bundle:
         Prepared colour [B, 3, H, W] and features [B, 12, H, W] (`preprocess.prepare`) -> [B, 3, H, W].
         Height and width are multiples of 32. An albedo filter runs first.
         """
+        inputs, modulation = self._inputs(color, features)
+        return hdr_from_gamma(self.model(*inputs) * modulation, self.gamma)
+
+    def radiance_with_layers(
+        self, color: Tensor, features: Tensor, layers: Mapping[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """As `radiance`, for one image; a kernel head filters `layers` [H, W] with the colour's kernels.
+
+        A layer whose name ends in R, G, or B is divided by that channel of the albedo as the colour
+        is. Other layers, such as alpha, are not. Layers are neither scaled nor clamped.
+        """
+        inputs, modulation = self._inputs(color, features)
+        albedo = torch.cat((modulation[0] ** self.gamma, torch.ones_like(modulation[0, :1])))
+        albedo = albedo[[layer_color(name) for name in layers]]
+        planes = torch.stack(list(layers.values())) / albedo
+        images = F.pad(planes, (0, 0, 0, 0, 0, -len(planes) % 3)).unflatten(0, (-1, 3))
+        out, filtered = self.model.forward_with_layers(*inputs, images)
+        filtered = filtered.flatten(0, 1)[: len(planes)] * albedo
+        return hdr_from_gamma(out * modulation, self.gamma), dict(zip(layers, filtered))
+
+    def _inputs(self, color: Tensor, features: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """The network's inputs for prepared colour and features, and the modulation of its output."""
         features = self.with_filtered_albedo(features)
         modulation = self.modulation(features)
         color_gamma = gamma_from_hdr(color, self.gamma) / modulation
-        return hdr_from_gamma(self.model(color_gamma, self.features_z_from_raw(features)) * modulation, self.gamma)
+        return (color_gamma, self.features_z_from_raw(features)), modulation
 
     def with_filtered_albedo(self, features: Tensor) -> Tensor:
         """Prepared features [B, 12, H, W] with the albedo (first hit) that the network sees.
@@ -117,10 +141,49 @@ class Bundle:
         sees the colour times `input_scale`, by default that of `input_scale(color_hdr)`.
         """
         color, feats, scale = preprocess.prepare(color_hdr, features, self.meta, input_scale)
-        device = next(self.model.parameters()).device
-        out = self.radiance(*(torch.from_numpy(preprocess.pad(x)[None]).to(device) for x in (color, feats)))
+        out = self.radiance(*(self._padded(x)[None] for x in (color, feats)))
         height, width = color.shape[-2:]
-        return out[0, :, :height, :width].cpu().numpy() / scale
+        image = out[0, :, :height, :width].cpu().numpy() / scale
+        return image * light.factors(color_hdr, image, self.meta)
+
+    @torch.inference_mode()
+    def denoise_with_layers(
+        self,
+        color_hdr: np.ndarray,
+        features: np.ndarray,
+        layers: Mapping[str, np.ndarray],
+        input_scale: float | None = None,
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """As `denoise`, with further channels [H, W] by name, as `demc-infer denoise --layers` filters them.
+
+        They are filtered with the kernels of the colour: layers that add up to it still do. Returns
+        the colour and the layers. Raises ValueError for a model without a kernel head.
+        """
+        if not layers:
+            return self.denoise(color_hdr, features, input_scale), {}
+        color, feats, scale = preprocess.prepare(color_hdr, features, self.meta, input_scale)
+        height, width = color.shape[-2:]
+        for name, plane in layers.items():
+            if plane.shape != (height, width):
+                raise ValueError(f"layer {name} is {list(plane.shape)}: expected [{height}, {width}]")
+            if not np.isfinite(plane).all():
+                raise ValueError(f"layer {name} contains NaN or infinite values")
+        planes = self._padded(np.stack([np.float32(plane) for plane in layers.values()]))
+        out, filtered = self.radiance_with_layers(
+            self._padded(color)[None], self._padded(feats)[None], dict(zip(layers, planes))
+        )
+        image = out[0, :, :height, :width].cpu().numpy() / scale
+        factors = light.factors(color_hdr, image, self.meta)
+        factors_by_color = (*factors, 1)  # None for alpha.
+        filtered = {
+            name: plane[:height, :width].cpu().numpy() * factors_by_color[layer_color(name)]
+            for name, plane in filtered.items()
+        }
+        return image * factors, filtered
+
+    def _padded(self, planes: np.ndarray) -> Tensor:
+        """Planes [C, H, W] on the network's device, padded to multiples of 32."""
+        return torch.from_numpy(preprocess.pad(planes)).to(next(self.model.parameters()).device)
 
     def to(self, device: torch.device | str) -> Bundle:
         """Moves the networks and the statistics to `device`, in place."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import OpenEXR
 
+from .files import replacing
 from .layouts import BUFFERS, MISSING, Layout, choose, either, printable, require
 
 LOSSLESS = ("NO_COMPRESSION", "RLE_COMPRESSION", "ZIPS_COMPRESSION", "ZIP_COMPRESSION", "PIZ_COMPRESSION")
@@ -127,11 +129,41 @@ class Frame:
         check_finite(self.file.path, names, planes)
         return planes.clip(0)
 
-    def write(self, path: str | os.PathLike, image: np.ndarray, precision: str | None = None) -> None:
-        """Writes the file with `image` [3, H, W] in place of its colour (`ExrFile.write`)."""
+    def layers(self, *patterns: str) -> dict[str, np.ndarray]:
+        """The channels [H, W] whose names match glob patterns, as float32, without those of the colour.
+
+        Raises ValueError for a pattern that matches nothing, and for a channel that is an input of
+        the network, has integers or another size, or holds NaN or infinite values.
+        """
+        path, channels = self.file.path, self.file.channels
+        for pattern in patterns:
+            if not any(fnmatchcase(name, pattern) for name in channels):
+                raise ValueError(f"{path}: no channel matches {pattern}; the file has {', '.join(channels)}")
+        color = self.layout.channels["color"]
+        matching = (name for name in channels if any(fnmatchcase(name, pattern) for pattern in patterns))
+        names = [name for name in matching if name not in color]
+        for name in names:
+            buffer = next((buffer for buffer in BUFFERS if name in self.layout.channels.get(buffer, ())), None)
+            if buffer is not None:
+                raise ValueError(f"{path}: channel {name} is no layer: it is the {buffer} that the network sees")
+            if channels[name].pixels.dtype == np.uint32:
+                raise ValueError(f"{path}: channel {name} is no layer: its type is uint, not half or float")
+        planes = self.file.planes([color[0], *names])[1:]
+        check_finite(path, names, planes)
+        return dict(zip(names, planes))
+
+    def write(
+        self,
+        path: str | os.PathLike,
+        image: np.ndarray,
+        precision: str | None = None,
+        layers: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """Writes the file with `image` [3, H, W] in place of its colour, and other `layers` [H, W] (`ExrFile.write`)."""
         if image.shape != self.color.shape:
             raise ValueError(f"image is {list(image.shape)}: expected {list(self.color.shape)}")
-        self.file.write(path, dict(zip(self.layout.channels["color"], image)), precision)
+        planes = dict(zip(self.layout.channels["color"], image)) | dict(layers or {})
+        self.file.write(path, planes, precision)
 
 
 def read_exr(
@@ -194,14 +226,11 @@ def check_finite(path: Path, names: Iterable[str], planes: np.ndarray) -> None:
 
 def write_whole(path: Path, file: OpenEXR.File) -> None:
     """Writes an EXR file completely or not at all. Raises OSError."""
-    unfinished = path.with_name(f".{path.stem}.unfinished.exr")
     try:
-        file.write(str(unfinished))
-        os.replace(unfinished, path)
+        with replacing(path) as unfinished:
+            file.write(str(unfinished))
     except RuntimeError as error:
         raise OSError(f"{path}: cannot write: {' '.join(str(error).split())}") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def as_kind(plane: np.ndarray, kind: type[np.floating]) -> np.ndarray:

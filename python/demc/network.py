@@ -268,25 +268,34 @@ class Decoder(nn.Module):
         else:
             self.head = conv3x3(levels[0], 3)
 
-    def forward(self, latent: Tensor, skips: Sequence[Sequence[Tensor]], color_gamma: Tensor) -> Tensor:
-        """The latent, and the five skips of each encoder, full resolution first -> [B, 3, H, W], >= 0."""
+    def forward(
+        self, latent: Tensor, skips: Sequence[Sequence[Tensor]], color_gamma: Tensor, layers: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        """The latent, and the five skips of each encoder, full resolution first -> [B, 3, H, W], >= 0.
+
+        A kernel head also filters `layers`.
+        """
         decoded = []
         for level, level_skips in zip(self.levels, reversed(list(zip(*skips)))):
             latent = level(latent, level_skips)
             decoded.append(latent)
         if self.head is not None:
-            return F.relu(self.head(latent))
+            return F.relu(self.head(latent)), None
         logits = [conv(x) for conv, x in zip(self.kernels, decoded[-KERNEL_LEVELS:])]
-        return kernel_head(logits, color_gamma)
+        return kernel_head(logits, color_gamma, layers)
 
 
-def kernel_head(logits: Sequence[Tensor], color_gamma: Tensor) -> Tensor:
+def kernel_head(
+    logits: Sequence[Tensor], color_gamma: Tensor, layers: Tensor | None = None
+) -> tuple[Tensor, Tensor | None]:
     """Filters the noisy colour with predicted kernels on four scales (Bako et al. 2017, Vogels et al. 2018).
 
     `logits` are [B, 25, H/8, W/8], then [B, 26, H/4, W/4] to [B, 26, H, W]: a 5x5 kernel, and the weight with which the
-    level below replaces low frequencies. Colour and output are [B, 3, H, W] in gamma space.
+    level below replaces low frequencies. Colour and output are [B, 3, H, W] in gamma space. For B = 1, the same kernels
+    filter `layers`, [L, 3, H, W] in linear light.
     """
-    images = [color_gamma.detach().clamp_min(0) ** KERNEL_GAMMA]
+    color = color_gamma.detach().clamp_min(0) ** KERNEL_GAMMA
+    images = [color if layers is None else torch.cat((color, layers))]
     for _ in logits[1:]:
         images.append(F.avg_pool2d(images[-1], 2))
     out = None
@@ -296,7 +305,9 @@ def kernel_head(logits: Sequence[Tensor], color_gamma: Tensor) -> Tensor:
             correction = F.interpolate(out - F.avg_pool2d(filtered, 2), scale_factor=2, mode="bilinear")
             filtered = filtered + level_logits[:, KERNEL_TAPS:].sigmoid() * correction
         out = filtered
-    return out.clamp_min(DARKEST) ** (1 / KERNEL_GAMMA) * (out > DARKEST)
+    out, filtered = out.split((len(color), len(out) - len(color)))
+    denoised = out.clamp_min(DARKEST) ** (1 / KERNEL_GAMMA) * (out > DARKEST)
+    return denoised, None if layers is None else filtered
 
 
 def filter5x5(image: Tensor, kernels: Tensor) -> Tensor:
@@ -335,6 +346,23 @@ class Denoiser(nn.Module):
 
         The output is in gamma space and not negative.
         """
+        return self._run(color_gamma, features_z, None)[0]
+
+    def forward_with_layers(self, color_gamma: Tensor, features_z: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
+        """As `forward`, for one image; the kernels of a kernel head also filter `layers`.
+
+        `layers` are [L, 3, H, W] in linear light, of either sign. Raises ValueError for another head
+        or several images.
+        """
+        if self.decoder.head is not None:
+            raise ValueError(f'layers need a model with head "kernel"; this one has "{self.config.head}"')
+        if len(color_gamma) != 1:
+            raise ValueError(f"layers need one image, not {len(color_gamma)}")
+        return self._run(color_gamma, features_z, layers)
+
+    def _run(
+        self, color_gamma: Tensor, features_z: Tensor, layers: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
         planes = {"color": color_gamma, "features": features_z}
         if self.fusion is not None:
             planes["detail"] = self.fusion(features_z)
@@ -342,7 +370,7 @@ class Denoiser(nn.Module):
         for encoder, names in zip(self.encoders, self.variant.encoders):
             encoder_skips, pooled = encoder(torch.cat([planes[name] for name in names], 1))
             skips.append(encoder_skips)
-        return self.decoder(self.latent(pooled), skips, color_gamma)
+        return self.decoder(self.latent(pooled), skips, color_gamma, layers)
 
     def detail_map(self, features_z: Tensor) -> Tensor | None:
         """[B, 12, H, W] -> [B, 3, H, W] (Fig. 2 e); None if the variant has no fusion sub-network."""

@@ -57,6 +57,11 @@ def pad(image: np.ndarray) -> np.ndarray:
     return np.pad(image, ((0, 0), (0, -height % SIZE_MULTIPLE), (0, -width % SIZE_MULTIPLE)), "edge")
 
 
+def layer_color(name: str) -> int:
+    """The colour channel whose albedo belongs to a layer: 0 for names that end in R, 1 in G, 2 in B, else 3."""
+    return {"r": 0, "g": 1, "b": 2}.get(name.rpartition(".")[2].lower(), 3)
+
+
 def input_scale(color_hdr: np.ndarray, meta: dict) -> float:
     """The factor on colour [3, H, W] before the network, which its output is divided by.
 

@@ -27,6 +27,8 @@ try:
     color, features = (demc.preprocess.pad(image)[None] for image in (color, features))
     [output] = session.run(["output"], {"color": color, "features": features})
     height, width = frame.color.shape[1:]
-    frame.write(arguments.output, output[0, :, :height, :width] / scale, precision="float")
+    image = output[0, :, :height, :width] / scale
+    image *= demc.light.factors(frame.color, image, meta)
+    frame.write(arguments.output, image, precision="float")
 except (OSError, ValueError) as error:
     sys.exit(f"error: {error}")

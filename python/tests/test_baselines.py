@@ -118,6 +118,19 @@ class References(Tools):
         window = np.where((np.arange(64) % 8 == 3)[None, :, None], 0, 4 * flat)
         self.assertLess(clean(window, flat, flat)[:, 3::8].max(), 0.002)
 
+    def test_shards_make_the_files_of_one_run(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            whole, shared = Path(folder) / "whole", Path(folder) / "shared"
+            self.assertEqual(run("references", "--data", SAMPLE, "-o", whole).returncode, 0)
+            for part in ("2/2", "1/2"):
+                ended = run("references", "--data", SAMPLE, "-o", shared, "--shard", part)
+                self.assertIn(f"references denoised; shard {part} is complete", ended.stdout)
+                self.assertFalse((shared / "manifest.json").exists())
+            ended = run("references", "--data", SAMPLE, "-o", shared)
+            self.assertIn("0 references denoised", ended.stdout)
+            files = lambda out: {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+            self.assertEqual(files(whole), files(shared))
+
     def test_guides_come_from_the_references_samples_if_present(self) -> None:
         import numpy as np
         from dataset import albedo, manifest

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import demc
+import numpy as np
 import torch
 from safetensors.torch import save_file
 
@@ -157,6 +158,50 @@ class Headers(unittest.TestCase):
             self.write()
             with self.assertRaisesRegex(ValueError, "expected five numbers of at least 1"):
                 demc.load(self.path)
+
+    def kernel_bundle(self) -> demc.Bundle:
+        """A network whose kernels differ from pixel to pixel, with albedo demodulation."""
+        torch.manual_seed(4)
+        config = demc.ModelConfig(width=2, head="kernel")
+        model = demc.Denoiser(config)
+        with torch.no_grad():
+            for weight in model.decoder.kernels.parameters():
+                weight.uniform_(-1, 1)
+        self.weights = model.state_dict()
+        self.meta["model"] = asdict(config)
+        self.meta["normalizer"] |= {"demodulate": 0.07, "exposure_level": 0.13}
+        self.write()
+        return demc.load(self.path)
+
+    def test_layers_that_add_up_to_the_colour_still_do(self) -> None:
+        bundle = self.kernel_bundle()
+        random = np.random.default_rng(1)
+        passes = 5 * random.random((2, 3, 40, 70), np.float32) ** 8
+        color, features = passes.sum(0), random.random((12, 40, 70), np.float32)
+        names = [f"{part}.{color}" for part in ("Diffuse", "lamp") for color in "RGB"]
+        layers = dict(zip(names, passes.reshape(6, 40, 70)))
+        layers |= {"flat.A": np.full((40, 70), 0.4), "flat.Z": np.full((40, 70), -3.0)}
+        image, filtered = bundle.denoise_with_layers(color, features, layers)
+        self.assertEqual(list(filtered), list(layers))
+        np.testing.assert_array_equal(image, bundle.denoise(color, features))
+        total = np.stack([filtered[name] for name in names]).reshape(2, 3, 40, 70).sum(0)
+        self.assertLessEqual(abs(total - image).max(), 1e-4 * image.max())
+        self.assertGreater(abs(total - color).max(), 0.1)
+        for name in ("flat.A", "flat.Z"):
+            np.testing.assert_allclose(filtered[name], layers[name], rtol=1e-5)
+        # The albedo of its own colour: constant light stays.
+        lit = {"x.g": 0.5 * (features[7] + 0.07)}
+        np.testing.assert_allclose(bundle.denoise_with_layers(color, features, lit)[1]["x.g"], lit["x.g"], rtol=1e-5)
+
+    def test_layers_that_cannot_be_filtered_are_refused(self) -> None:
+        self.write()
+        color, features = np.ones((3, 8, 8)), np.ones((12, 8, 8))
+        with self.assertRaisesRegex(ValueError, 'head "kernel"; this one has "grey"'):
+            demc.load(self.path).denoise_with_layers(color, features, {"A": color[0]})
+        bundle = self.kernel_bundle()
+        for plane, words in ((np.ones((8, 7)), r"\[8, 7\]: expected \[8, 8\]"), (np.full((8, 8), np.nan), "NaN")):
+            with self.assertRaisesRegex(ValueError, f"layer lamp.R .*{words}"):
+                bundle.denoise_with_layers(color, features, {"lamp.R": plane})
 
     def test_the_command_prints_one_line(self) -> None:
         del self.meta["normalizer"]

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import unittest
+from dataclasses import asdict
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -78,6 +79,43 @@ class Examples(unittest.TestCase):
                         self.assertLessEqual(np.abs(mine - channel.pixels).max(), TOLERANCE * largest)
                     changed += not np.array_equal(mine, noisy.channels[name].pixels)
                 self.assertEqual(changed, 3)
+
+    def kernel_model(self) -> Path:
+        """A random network whose kernels differ from pixel to pixel, with the albedo filter of the bundled model."""
+        import demc
+        import torch
+        from safetensors.torch import save_file
+
+        bundle = demc.load(self.models["torch"])
+        torch.manual_seed(4)
+        config = demc.ModelConfig(width=4, head="kernel")
+        bundle.model = demc.Denoiser(config)
+        with torch.no_grad():
+            for weight in bundle.model.decoder.kernels.parameters():
+                weight.uniform_(-1, 1)
+        path = self.folder / "kernel.safetensors"
+        save_file(bundle.tensors(), path, {"demc": json.dumps(bundle.meta | {"model": asdict(config)})})
+        return path
+
+    def test_layers_are_those_of_demc_infer(self) -> None:
+        import numpy as np
+        from demc.exr import ExrFile
+
+        model, expected, found = self.kernel_model(), self.folder / "rust.exr", self.folder / "torch.exr"
+        layers = "--layers", "*.A", "--layers", "*Depth*"
+        for name in ("cycles-4.5", "cycles-alpha"):
+            source = RENDERERS / f"{name}.exr"
+            options = "--model", model, "--overwrite", "--precision", "float", *layers
+            self.succeed("demc-infer", "denoise", source, "-o", expected, *options)
+            self.succeed(sys.executable, PACKAGE / "examples" / "torch_denoise.py", model, source, found, *layers)
+            noisy, theirs, ours = (ExrFile(path).channels for path in (source, expected, found))
+            changed = []
+            for channel in theirs:
+                mine, other = ours[channel].pixels, theirs[channel].pixels
+                with self.subTest(name, channel=channel):
+                    self.assertLessEqual(np.abs(mine - other).max(), TOLERANCE * np.abs(other).max())
+                changed += [channel] if not np.array_equal(mine, noisy[channel].pixels) else []
+            self.assertEqual(len([x for x in changed if x.endswith((".A", "Depth.Z"))]), 2, changed)
 
     def test_a_mistake_is_one_line(self) -> None:
         for kind in self.models:

@@ -232,6 +232,26 @@ class Writing(Files):
         self.assert_only_colour_changed(*self.copy(), set("RGB"))
         self.assertEqual({self.copy("float")[1].channels[x].pixels.dtype for x in "RGB"}, {np.dtype("f4")})
 
+    def test_layers_are_chosen_by_patterns_and_written(self) -> None:
+        self.write(self.planes(MITSUBA) | self.planes(["lamp.R", "lamp.G", "fog.A"], kind="f2") | self.planes(["id"], kind="u4"))
+        frame = demc.read_exr(self.path)
+        layers = frame.layers("lamp.*", "[RGB]", "*.A")
+        self.assertEqual(sorted(layers), ["fog.A", "lamp.G", "lamp.R"])
+        self.assertEqual(layers["fog.A"].dtype, np.float32)
+        frame.write(self.folder / "y.exr", frame.color, layers={name: 0.25 - plane for name, plane in layers.items()})
+        written = ExrFile(self.folder / "y.exr").channels
+        for name, plane in layers.items():
+            np.testing.assert_allclose(written[name].pixels, 0.25 - plane, atol=5e-4)
+        np.testing.assert_array_equal(written["id"].pixels, frame.file.channels["id"].pixels)
+        for pattern, message in (
+            ("sun.*", "no channel matches sun.*; the file has B, "),
+            ("normal.X", "channel normal.X is no layer: it is the normal that the network sees"),
+            ("id", "channel id is no layer: its type is uint, not half or float"),
+        ):
+            with self.assertRaises(ValueError) as caught:
+                frame.layers(pattern)
+            self.assertIn(message, str(caught.exception))
+
     def test_lossy_compression_becomes_zip(self) -> None:
         rng = np.random.default_rng(2)
         self.write({name: rng.random((64, 64), "f4") for name in MITSUBA}, compression=OpenEXR.DWAB_COMPRESSION)

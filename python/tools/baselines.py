@@ -6,7 +6,9 @@
 
 oidn             Intel's Open Image Denoise: HDR colour, noisy albedo (first hit), noisy normal
 oidn-prefilter   the same; albedo and normal are denoised first, as its documentation recommends
-oidn-color       the same without albedo and normal
+oidn-fast, oidn-fast-prefilter
+                 the same two in the quality "fast"
+oidn-color       the first without albedo and normal
 oidn-reference   the denoised *references*: about the best possible score
 nlm              non-local means of scikit-image on log(1 + 16 x), without features; its strength is
                  the noise that scikit-image estimates per image
@@ -19,6 +21,7 @@ replaced.
 import argparse
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,14 +34,14 @@ LOG_SCALE = 16
 """Factor of the radiance before log(1 + x); dark and bright noise then have similar size."""
 
 
-def oidn(frame: Frame) -> np.ndarray:
+def oidn(frame: Frame, quality: str = "high") -> np.ndarray:
     import pyoidn
 
-    return pyoidn.denoise(pixels(frame.color), albedo=albedo(frame), normal=normal(frame), hdr=True)
+    return pyoidn.denoise(pixels(frame.color), albedo=albedo(frame), normal=normal(frame), hdr=True, quality=quality)
 
 
-def oidn_prefilter(frame: Frame) -> np.ndarray:
-    return with_prefilter(pixels(frame.color), albedo(frame), normal(frame))
+def oidn_prefilter(frame: Frame, quality: str = "high") -> np.ndarray:
+    return with_prefilter(pixels(frame.color), albedo(frame), normal(frame), quality)
 
 
 def oidn_color(frame: Frame) -> np.ndarray:
@@ -67,6 +70,8 @@ def nlm(frame: Frame) -> np.ndarray:
 DENOISERS: dict[str, Callable[[Frame], np.ndarray]] = {
     "oidn": oidn,
     "oidn-prefilter": oidn_prefilter,
+    "oidn-fast": partial(oidn, quality="fast"),
+    "oidn-fast-prefilter": partial(oidn_prefilter, quality="fast"),
     "oidn-color": oidn_color,
     "oidn-reference": oidn_reference,
     "nlm": nlm,

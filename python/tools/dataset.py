@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import OpenEXR
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from demc.exr import Frame, write_whole
+from demc.files import write_json
 
 
 def add_layout_flags(parser: argparse.ArgumentParser) -> None:
@@ -67,6 +67,4 @@ def write(path: Path, channels: dict[str, np.ndarray]) -> None:
 
 
 def write_manifest(data: Path, manifest: dict) -> None:
-    unfinished = data / ".manifest.json.unfinished"
-    unfinished.write_text(json.dumps(manifest, indent=1))
-    os.replace(unfinished, data / "manifest.json")
+    write_json(data / "manifest.json", manifest)

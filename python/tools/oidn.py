@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 
-def with_prefilter(color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def with_prefilter(color: np.ndarray, albedo: np.ndarray, normal: np.ndarray, quality: str = "high") -> np.ndarray:
     """Linear HDR colour, denoised with albedo and normal as guides; all `[H, W, 3]` float32."""
     import pyoidn
 
+    guides = {name: prefiltered(name, feature, quality) for name, feature in (("albedo", albedo), ("normal", normal))}
     # clean_aux: the features have no noise.
-    return pyoidn.denoise(color, albedo=prefiltered("albedo", albedo), normal=prefiltered("normal", normal), hdr=True, clean_aux=True)
+    return pyoidn.denoise(color, **guides, hdr=True, clean_aux=True, quality=quality)
 
 
-def prefiltered(kind: str, feature: np.ndarray) -> np.ndarray:
-    """One feature, `albedo` or `normal`, denoised without guides."""
+def prefiltered(kind: str, feature: np.ndarray, quality: str = "high") -> np.ndarray:
+    """One feature, `albedo` or `normal`, denoised without guides; `quality` is `high` or `fast`."""
     import pyoidn
 
     out = np.empty_like(feature)
@@ -24,6 +25,7 @@ def prefiltered(kind: str, feature: np.ndarray) -> np.ndarray:
         try:
             filter.set_image(kind, feature, pyoidn.OIDN_FORMAT_FLOAT3)
             filter.set_image(pyoidn.OIDN_IMAGE_OUTPUT, out, pyoidn.OIDN_FORMAT_FLOAT3)
+            filter.set_quality(getattr(pyoidn, f"OIDN_QUALITY_{quality.upper()}"))
             filter.commit()
             filter.execute()
             message = device.get_error()

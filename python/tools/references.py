@@ -16,6 +16,7 @@ Use it for references of some hundred samples per pixel, which have visible nois
 - All other channels and attributes are copied. Scenes of the test split are listed, not copied.
 - Existing files are kept unless their source is newer.
 - `ref_denoised` in the manifest marks the denoised references.
+- `--shard I/N` denoises a part of the references on a farm (docs/farms.md).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from pathlib import Path
 import numpy as np
 from dataset import add_layout_flags, albedo, manifest, normal, pixels, reference, write_manifest
 from demc.exr import Frame, read_exr
+from demc.shard import add_shard_flag
 from oidn import with_prefilter
 
 LIGHTER = 3.0
@@ -97,26 +99,33 @@ def main() -> int:
     parser.add_argument("--data", type=Path, required=True, help="directory with manifest.json")
     parser.add_argument("-o", "--output", type=Path, required=True, help="directory of the new data set, created if missing")
     add_layout_flags(parser)
+    add_shard_flag(parser, "training scenes")
     arguments = parser.parse_args()
-    data, output = arguments.data, arguments.output
+    data, output, shard = arguments.data, arguments.output, arguments.shard
     try:
         if output.resolve() == data.resolve():
             raise ValueError(f"{output}: expected another directory than --data")
         listed = manifest(data)
         output.mkdir(parents=True, exist_ok=True)
         denoised = 0
+        names = {scene["name"] for scene in listed["scenes"] if scene["split"] == "train"}
+        own = shard.keep(names) if shard else names
         for scene in listed["scenes"]:
             source = data / scene["file"]
             if scene["split"] == "train":
                 scene |= {"file": f"train/{scene['name']}.exr", "ref_denoised": "Open Image Denoise"}
                 scene.pop("ref_residual_relmse", None)
-                if stale(output / scene["file"], source):
+                if scene["name"] in own and stale(output / scene["file"], source):
                     rewrite(source, output / scene["file"], arguments.layout, arguments.layer)
                     denoised += 1
             else:
                 scene["file"] = os.path.relpath(source.resolve(), output.resolve())
-        write_manifest(output, listed)
-        print(f"{output}: {denoised} references denoised, {len(listed['scenes'])} scenes listed")
+        done = f"{output}: {denoised} references denoised"
+        if shard:
+            print(f"{done}; shard {shard} is complete")
+        else:
+            write_manifest(output, listed)
+            print(f"{done}, {len(listed['scenes'])} scenes listed")
     except (OSError, ValueError, KeyError, RuntimeError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -2,7 +2,7 @@
 
 use burn::tensor::Device;
 use demc_data::{ChannelLayout, FEATURES, FeatureStats, Frame, Normalizer, PositionSpace};
-use demc_model::{ModelConfig, Reading, Variant, Weights};
+use demc_model::{Head, ModelConfig, Reading, Variant, Weights};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -11,10 +11,32 @@ use super::{Bundle, BundleMeta};
 
 /// A network of base width 2 in the released reading, which has the most batch normalisation.
 pub(crate) fn bundle(variant: Variant) -> Bundle {
+    bundle_with(variant, Head::default())
+}
+
+/// The network of [`bundle`] with a kernel head, whose kernels differ from pixel to pixel.
+pub(crate) fn kernel_bundle() -> Bundle {
+    let mut bundle = bundle_with(Variant::Demc, Head::Kernel);
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    let mut weights = bundle.model.weights();
+    for weight in &mut weights {
+        if weight.name.starts_with("decoder.kernels") {
+            let random = |value: &mut f32| *value = rng.random_range(-2.0..2.0);
+            weight.data.iter_mut().for_each(random);
+        }
+    }
+    let mut weights = Weights::new(weights);
+    let loaded = bundle.meta.model.load(&mut weights, &Device::flex());
+    bundle.model = loaded.expect("its own weights");
+    bundle
+}
+
+fn bundle_with(variant: Variant, head: Head) -> Bundle {
     let model = ModelConfig {
         variant,
         reading: Reading::Released,
         width: 2,
+        head,
         ..ModelConfig::default()
     };
     let features = FeatureStats {
@@ -26,6 +48,7 @@ pub(crate) fn bundle(variant: Variant) -> Bundle {
         albedo_demodulation_epsilon: None,
         position: PositionSpace::Scene,
         exposure_level: None,
+        restore_light: false,
         features,
         flat_color: [0.4, 0.3, 0.2],
     };

@@ -14,7 +14,8 @@ use demc_infer::Bundle;
 use serde::Serialize;
 
 use super::flags::{DeviceFlag, ModelFlag};
-use super::inputs::{Frames, Inputs};
+use super::frames::Frames;
+use super::inputs::Inputs;
 use super::layouts::{LayoutFlags, Layouts, say};
 use super::{Clamped, utf8_for_json};
 
@@ -34,8 +35,8 @@ pub struct Arguments {
     /// Images: files, directories, glob patterns, or frame sequences
     #[arg(value_name = "IN.exr", required = true)]
     inputs: Vec<PathBuf>,
-    /// Only these frames of sequences
-    #[arg(long, value_name = "FIRST-LAST")]
+    /// Only these frames of sequences, such as 7, 1-240, or 1-10,15,20-40x2 (every second one)
+    #[arg(long, value_name = "LIST")]
     frames: Option<Frames>,
     /// Print JSON
     #[arg(long)]
@@ -78,7 +79,7 @@ struct ChannelCheck {
 impl Arguments {
     /// Checks every image. Unreadable ones are reported.
     pub fn run(self) -> anyhow::Result<()> {
-        let inputs = Inputs::expand(&self.inputs, self.frames)?;
+        let inputs = Inputs::expand(&self.inputs, self.frames.as_ref())?;
         if self.json {
             inputs
                 .files

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use demc_data::exr::rewrite::{OutputChannels, WriteOptions, rewrite};
+use demc_data::exr::rewrite::{OutputChannels, WriteOptions, rewrite_with_layers};
 use demc_data::exr::{Compression, ExrFile};
 use demc_data::frame::{decode_input, decode_repaired};
 use demc_data::output::{Directories, Outputs};
@@ -14,11 +14,14 @@ use demc_infer::{Bundle, Picture, memory};
 
 use super::Clamped;
 use super::exposure::{InputScaleFlag, SequenceScales, stops};
-use super::flags::{DeviceFlag, EnsembleFlag, ModelFlag, TilingFlags, describe};
-use super::inputs::{Frames, Inputs};
+use super::flags::{DeviceFlag, EnsembleFlag, LightFlag, ModelFlag, TilingFlags, describe};
+use super::frames::Frames;
+use super::inputs::Inputs;
 use super::jobs::{Job, Jobs};
+use super::layers::{LayersFlag, read_layers};
 use super::layouts::{LayoutFlags, Layouts};
 use super::progress::Progress;
+use super::shard::Shard;
 use super::warnings::Warnings;
 
 /// Largest cache of an input's decoded blocks in bytes, kept until its output is written (ours:
@@ -41,7 +44,7 @@ fn cache_bytes() -> usize {
 /// Cycles or FBKSD write. --layout chooses other names. An image that differs from the training
 /// data causes a warning with the likely cause. Negative radiance counts as 0.
 ///
-/// The output is the input with denoised colour. Parts, windows, attributes, compression and all
+/// The output is the input with denoised colour and layers. Parts, windows, attributes, compression and all
 /// other channels stay.
 ///
 /// An image that does not fit into memory is denoised in tiles with the same result. `demc-infer
@@ -51,12 +54,16 @@ fn cache_bytes() -> usize {
   demc-infer denoise noisy.exr -o clean.exr
   demc-infer denoise --model runs/quickstart noisy.exr -o clean.exr --png
   demc-infer denoise --model demc.safetensors renders/ -o denoised/
-  demc-infer denoise 'shot.####.exr' --frames 1-240 -o denoised/")]
+  demc-infer denoise 'shot.####.exr' --frames 1-10,15,20-40x2 -o denoised/
+  demc-infer denoise 'shot.####.exr' --shard 3/8 -o denoised/
+  demc-infer denoise --model runs/kernels shot.exr --layers 'ViewLayer.Combined_*' -o clean.exr")]
 pub struct Arguments {
     #[command(flatten)]
     model: ModelFlag,
     #[command(flatten)]
     layout: LayoutFlags,
+    #[command(flatten)]
+    layers: LayersFlag,
     /// Noisy images with feature channels: files, directories (their *.exr), glob patterns, or
     /// frame sequences (shot.####.exr or shot.%04d.exr)
     #[arg(value_name = "IN.exr", required = true)]
@@ -72,9 +79,13 @@ pub struct Arguments {
     /// Replace existing outputs and previews. Inputs are never replaced
     #[arg(long)]
     overwrite: bool,
-    /// Only these frames of sequences
-    #[arg(long, value_name = "FIRST-LAST")]
+    /// Only these frames of sequences, such as 7, 1-240, or 1-10,15,20-40x2 (every second one)
+    #[arg(long, value_name = "LIST")]
     frames: Option<Frames>,
+    /// Only part I of N of the images, from 1/N to N/N: sorted by file name, the Ith and every Nth
+    /// after it
+    #[arg(long, value_name = "I/N")]
+    shard: Option<Shard>,
     #[command(flatten)]
     output_flags: OutputFlags,
     /// Also write a preview NAME.png beside each output, unless it exists: clip(2^EXPOSURE x, 0, 1)^(1/2.2)
@@ -95,6 +106,8 @@ pub struct Arguments {
     #[command(flatten)]
     ensemble: EnsembleFlag,
     #[command(flatten)]
+    light: LightFlag,
+    #[command(flatten)]
     tiling: TilingFlags,
     #[command(flatten)]
     device: DeviceFlag,
@@ -102,9 +115,16 @@ pub struct Arguments {
 
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
-        let inputs = Inputs::expand(&self.inputs, self.frames)?;
-        let incomplete = inputs.report_missing();
+        let inputs = Inputs::expand(&self.inputs, self.frames.as_ref())?;
+        // One worker of a farm reports them, not all.
+        let incomplete = match self.shard.is_none_or(Shard::is_first) {
+            true => inputs.report_missing(),
+            false => 0,
+        };
         let mut jobs = Jobs::new(&inputs, &self.output, self.png)?;
+        if let Some(shard) = self.shard {
+            jobs.keep(shard);
+        }
         let mut outputs = Outputs::default();
         self.model.protect(&mut outputs);
         self.layout.protect(&mut outputs);
@@ -126,6 +146,7 @@ impl Arguments {
         }
         let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
+        self.layers.check(&bundle, self.ensemble.passes)?;
         outputs.prepare(match jobs.directory {
             true => Directories::Create,
             false => Directories::Expect,
@@ -181,17 +202,25 @@ impl Arguments {
         let file = ExrFile::open(&job.input)?;
         let say = |choice: &str| progress.line(format_args!("note: {name}: {choice}"));
         let layout = &layouts.of(&file, bundle, say)?;
+        let names = self.layers.names(&file, layout)?;
         let mut file = file.keeping(layout, cache_bytes());
-        let frame = match self.repair {
-            false => decode_input(&mut file, layout)?,
-            true => {
-                let (frame, repaired) = decode_repaired(&mut file, layout)?;
-                if repaired > 0 {
-                    progress.line(format_args!("note: {name}: {repaired} samples repaired"));
-                }
-                frame
-            }
+        let (mut frame, repaired) = match self.repair {
+            false => (decode_input(&mut file, layout)?, 0),
+            true => decode_repaired(&mut file, layout)?,
         };
+        let (layers, more) = read_layers(&mut file, layout, &names, self.repair)?;
+        if repaired + more > 0 {
+            let repaired = repaired + more;
+            progress.line(format_args!("note: {name}: {repaired} samples repaired"));
+        }
+        if layout
+            .alpha
+            .as_ref()
+            .is_some_and(|alpha| names.contains(alpha))
+        {
+            // As a layer, alpha needs no pass of its own.
+            frame.alpha = None;
+        }
         let warn = |warning: &Warning| {
             if let Some(line) = warnings.first(&job.input, warning) {
                 progress.line(format_args!("warning: {line}"));
@@ -203,6 +232,8 @@ impl Arguments {
             tiling,
             ensemble: self.ensemble.passes,
             input_scale,
+            restore_light: self.light.restore_light,
+            layers,
         };
         let on_tile = |done, count| {
             if count > 1 {
@@ -239,10 +270,13 @@ impl Arguments {
         };
         let mut planes = denoised.color_hdr;
         planes.extend(denoised.alpha.into_iter().flatten());
-        for note in self
-            .output_flags
-            .write(&mut file, output, layout, &planes)?
-        {
+        planes.extend(denoised.layers);
+        let replaced = Replaced {
+            layout,
+            layers: &names,
+            planes: &planes,
+        };
+        for note in self.output_flags.write(&mut file, output, &replaced)? {
             progress.line(format_args!("note: {name}: {note}"));
         }
         Ok(frame.clamped)
@@ -252,7 +286,7 @@ impl Arguments {
 /// `--precision`, `--compression`, `--only-color`.
 #[derive(Args)]
 struct OutputFlags {
-    /// Type of the colour channels: half has 11 bits of precision and a maximum of 65504 [default:
+    /// Type of the channels of colour and layers: half has 11 bits of precision and a maximum of 65504 [default:
     /// as the input]
     #[arg(long, value_enum)]
     precision: Option<OutputPrecision>,
@@ -260,7 +294,7 @@ struct OutputFlags {
     /// as the input, or zip if that would change the copied channels]
     #[arg(long, value_name = "NAME")]
     compression: Option<Compression>,
-    /// Write only colour and alpha
+    /// Write only colour, alpha and layers
     #[arg(long)]
     only_color: bool,
 }
@@ -273,15 +307,21 @@ enum OutputPrecision {
     Float,
 }
 
+/// The channels with other values: colour, alpha if there is a plane for it, and layers.
+struct Replaced<'a> {
+    layout: &'a ChannelLayout,
+    layers: &'a [String],
+    planes: &'a [f32],
+}
+
 impl OutputFlags {
-    /// Writes `output`: `input` with the denoised colour. Returns notes about other
-    /// differences from the input.
+    /// Writes `output`: `input` with the denoised channels. Returns notes about other differences
+    /// from the input.
     fn write(
         &self,
         input: &mut ExrFile,
         output: &Path,
-        layout: &ChannelLayout,
-        color_hdr: &[f32],
+        replaced: &Replaced,
     ) -> Result<Vec<String>, demc_data::Error> {
         let options = WriteOptions {
             channels: match self.only_color {
@@ -294,7 +334,12 @@ impl OutputFlags {
             }),
             compression: self.compression,
         };
-        let written = rewrite(input, layout, color_hdr, output, &options)?;
+        let Replaced {
+            layout,
+            layers,
+            planes,
+        } = replaced;
+        let written = rewrite_with_layers(input, layout, layers, planes, output, &options)?;
         let mut notes: Vec<String> = written.changes.iter().map(ToString::to_string).collect();
         if written.clamped > 0 {
             let clamped = written.clamped;

@@ -19,6 +19,9 @@ use super::scenes::Scenes;
 /// often scores better than the noisy one, so compare with both. A score near the reference's
 /// residual has no meaning.
 ///
+/// The data set's manifest and headers are checked first. A scene that cannot be read or scored is
+/// then reported and skipped, and the exit code is 1.
+///
 /// --baseline adds other programs' images of the same scenes. Differences from them are paired by
 /// image, with 95 % bootstrap intervals.
 #[derive(Args)]
@@ -54,7 +57,7 @@ impl Arguments {
         }
         let report = self.scenes.score(|_, _| Ok(()), |(), _| Ok(()))?;
         // The table comes first, so that a failed write does not lose it.
-        if self.json.as_deref() != Some(Path::new("-")) {
+        if self.json.as_deref() != Some(Path::new("-")) && !report.images.is_empty() {
             let headlines = METRICS[..2].iter().map(|metric| metric.name);
             let more_names = more.iter().map(|metric| metric.name);
             let names: Vec<_> = headlines.chain(more_names).collect();
@@ -64,16 +67,16 @@ impl Arguments {
             }
             message::result(&text)?;
         }
-        let Some(path) = &self.json else {
-            return Ok(());
-        };
-        let mut differences = report.differences();
-        differences.retain(|difference| difference.against != "noisy");
-        let json = ScoresJson {
-            report: &report,
-            differences,
-        };
-        super::write_text(path, &message::json(&json)?)
+        if let Some(path) = &self.json {
+            let mut differences = report.differences();
+            differences.retain(|difference| difference.against != "noisy");
+            let json = ScoresJson {
+                report: &report,
+                differences,
+            };
+            super::write_text(path, &message::json(&json)?)?;
+        }
+        super::scenes::require_all(&report)
     }
 }
 

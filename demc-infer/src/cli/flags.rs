@@ -77,6 +77,24 @@ pub struct EnsembleFlag {
     pub passes: Ensemble,
 }
 
+/// `--restore-light`.
+#[derive(Args)]
+pub struct LightFlag {
+    /// Whether the output gets the light of the noisy image back, where the network made it darker or
+    /// brighter [default: as the model says]
+    #[arg(long = "restore-light", value_name = "on|off", value_parser = switch)]
+    pub restore_light: Option<bool>,
+}
+
+/// `on` or `off`.
+fn switch(text: &str) -> Result<bool, &'static str> {
+    match text {
+        "on" => Ok(true),
+        "off" => Ok(false),
+        _ => Err("must be on or off"),
+    }
+}
+
 /// `--halo`, `--tile`, `--memory`.
 #[derive(Args)]
 pub struct TilingFlags {

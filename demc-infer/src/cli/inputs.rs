@@ -3,32 +3,11 @@
 use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 use demc_data::message;
 
 use super::UsageError;
-
-/// Range of frame numbers: `7` or `1-240`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Frames {
-    first: u64,
-    last: u64,
-}
-
-impl FromStr for Frames {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let (first, last) = text.split_once('-').unwrap_or((text, text));
-        let number = |text: &str| text.parse().map_err(|_| "not N or FIRST-LAST".to_owned());
-        let (first, last) = (number(first)?, number(last)?);
-        match first <= last {
-            true => Ok(Self { first, last }),
-            false => Err(format!("{first} is after {last}")),
-        }
-    }
-}
+use super::frames::Frames;
 
 /// The input images of a command line.
 #[derive(Debug)]
@@ -50,13 +29,12 @@ pub struct Sequence {
     pub samples: Vec<PathBuf>,
     /// Names the missing frames, if there are any.
     pub missing: Option<String>,
+    /// Says how many chosen frames are after the last one, if there are any.
+    pub after: Option<String>,
 }
 
 /// Number of frames from which the exposure of a sequence is measured.
 const SAMPLES: usize = 8;
-
-/// Largest number of gaps that a message names.
-const MAX_GAPS: usize = 20;
 
 impl Inputs {
     /// Expands `arguments`.
@@ -67,7 +45,7 @@ impl Inputs {
     ///
     /// # Errors
     /// A directory, pattern or sequence without files; `frames` without a sequence.
-    pub fn expand(arguments: &[PathBuf], frames: Option<Frames>) -> Result<Self, UsageError> {
+    pub fn expand(arguments: &[PathBuf], frames: Option<&Frames>) -> Result<Self, UsageError> {
         let mut files = Vec::new();
         let mut several = arguments.len() > 1;
         let mut sequences = Vec::new();
@@ -109,8 +87,13 @@ impl Inputs {
         })
     }
 
-    /// Reports missing frames of sequences. Returns the number of sequences that have any.
+    /// Reports missing frames of sequences, and notes those after their ends. Returns the number of
+    /// sequences with missing frames.
     pub fn report_missing(&self) -> usize {
+        let after = self.sequences.iter();
+        for after in after.filter_map(|sequence| sequence.after.as_ref()) {
+            message::say(format_args!("note: {after}"));
+        }
         let missing = self.sequences.iter();
         let missing = missing.filter_map(|sequence| sequence.missing.as_ref());
         missing
@@ -186,7 +169,7 @@ impl<'a> SequencePattern<'a> {
         })
     }
 
-    fn expand(&self, frames: Option<Frames>) -> Result<Sequence, UsageError> {
+    fn expand(&self, frames: Option<&Frames>) -> Result<Sequence, UsageError> {
         let parent = match self.argument.parent() {
             Some(parent) if parent != Path::new("") => parent,
             _ => Path::new("."),
@@ -198,14 +181,39 @@ impl<'a> SequencePattern<'a> {
         found.sort();
         let samples = found.iter().step_by(found.len().div_ceil(SAMPLES).max(1));
         let samples = samples.map(|(_, path)| path.clone()).collect();
-        if let Some(frames) = frames {
-            found.retain(|(number, _)| (frames.first..=frames.last).contains(number));
+        let numbers: Vec<u64> = found.iter().map(|(number, _)| *number).collect();
+        let (mut missing, mut after) = (None, None);
+        if let (Some(&first), Some(&last)) = (numbers.first(), numbers.last()) {
+            let all = Frames::between(first, last);
+            let chosen = frames.unwrap_or(&all);
+            found.retain(|(number, _)| chosen.contains(*number));
+            if found.is_empty() {
+                return Err(UsageError(format!(
+                    "{}: none of the chosen frames exists; the sequence has {} from {first} to {last}",
+                    self.argument.display(),
+                    numbers.len()
+                )));
+            }
+            let argument = self.argument.display();
+            let until = chosen.up_to(last);
+            let gaps = until.without(&numbers);
+            missing = (gaps.count() > 0).then(|| {
+                let (gaps, count, all) = (gaps.describe(), gaps.count(), until.count());
+                format!("{argument}: {count} of {all} frames are missing: {gaps}")
+            });
+            let beyond = chosen.count() - until.count();
+            after = (beyond > 0).then(|| {
+                let all = chosen.count();
+                format!(
+                    "{argument}: {beyond} of {all} chosen frames are after its last one, {last}"
+                )
+            });
         }
-        let missing = missing(&found, frames);
         Ok(Sequence {
-            missing: missing.map(|frames| format!("{}: {frames}", self.argument.display())),
             files: found.into_iter().map(|(_, path)| path).collect(),
             samples,
+            missing,
+            after,
         })
     }
 
@@ -240,37 +248,6 @@ fn percent(name: &str) -> Option<(usize, usize, usize)> {
     (name[..end].ends_with('d')).then(|| (start, end, width.parse().unwrap_or(1)))
 }
 
-/// Names the missing frames: `2 of 5 frames are missing: 5-6`.
-fn missing(found: &[(u64, PathBuf)], frames: Option<Frames>) -> Option<String> {
-    let first = frames.map_or(found.first()?.0, |frames| frames.first);
-    let last = frames.map_or(found.last()?.0, |frames| frames.last);
-    let mut gaps = Vec::new();
-    let mut missing = 0;
-    let mut next = first;
-    let end = [last.saturating_add(1)];
-    for number in found.iter().map(|(number, _)| *number).chain(end) {
-        if number > next {
-            missing += number - next;
-            gaps.push(match number - next {
-                1 => format!("{next}"),
-                _ => format!("{next}-{}", number - 1),
-            });
-        }
-        next = number.saturating_add(1);
-    }
-    let frames = last - first;
-    (missing > 0).then(|| {
-        let hidden = gaps.len().saturating_sub(MAX_GAPS);
-        gaps.truncate(MAX_GAPS);
-        let more = if hidden > 0 { ", ..." } else { "" };
-        let gaps = gaps.join(", ");
-        format!(
-            "{missing} of {} frames are missing: {gaps}{more}",
-            frames.saturating_add(1)
-        )
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -285,7 +262,7 @@ mod tests {
 
     fn names(dir: &tempfile::TempDir, argument: &str, frames: Option<&str>) -> Vec<String> {
         let frames = frames.map(|text| text.parse().expect("frames"));
-        let found = Inputs::expand(&[dir.path().join(argument)], frames).expect("files");
+        let found = Inputs::expand(&[dir.path().join(argument)], frames.as_ref()).expect("files");
         let name = |path: &PathBuf| path.file_name().map(|name| name.to_string_lossy().into());
         found.files.iter().filter_map(name).collect()
     }
@@ -336,26 +313,26 @@ mod tests {
         let absent = dir.path().join("absent.exr");
         let found = Inputs::expand(std::slice::from_ref(&absent), None).expect("as it is");
         assert_eq!((found.files, found.several), (vec![absent], false));
-        let error = Inputs::expand(&["a.exr".into()], "1-2".parse().ok()).expect_err("no sequence");
+        let frames = "1-2".parse().ok();
+        let error = Inputs::expand(&["a.exr".into()], frames.as_ref()).expect_err("no sequence");
         assert!(error.to_string().starts_with("--frames needs"), "{error}");
     }
 
     #[test]
-    fn frames_are_a_number_or_two() {
-        let frames = |text: &str| text.parse::<Frames>();
-        assert_eq!(frames("7"), frames("7-7"));
-        for wrong in ["", "a", "5-", "9-3", "1-2-3", "-4"] {
-            assert!(frames(wrong).is_err(), "{wrong}");
-        }
-    }
-
-    #[test]
-    fn gaps_are_counted() {
-        let found: Vec<_> = [3, 4, 7].map(|n| (n, PathBuf::new())).into();
-        let message = missing(&found, None).expect("a gap");
-        assert_eq!(message, "2 of 5 frames are missing: 5-6");
-        let message = missing(&found, "1-9".parse().ok()).expect("gaps");
-        assert_eq!(message, "6 of 9 frames are missing: 1-2, 5-6, 8-9");
-        assert_eq!(missing(&found[..2], None), None);
+    fn missing_frames_are_named_and_frames_after_the_last_are_noted() {
+        let dir = directory_of(&["s.03.exr", "s.04.exr", "s.07.exr"]);
+        let told = |frames: Option<&str>| {
+            let frames = frames.map(|text| text.parse::<Frames>().expect("frames"));
+            let found = Inputs::expand(&[dir.path().join("s.##.exr")], frames.as_ref());
+            let sequence = found.expect("frames").sequences.remove(0);
+            let end = |text: Option<String>| Some(text?.split_once(": ")?.1.to_owned());
+            (end(sequence.missing), end(sequence.after))
+        };
+        let missing = |text: &str| Some(format!("{text} frames are missing: 5-6"));
+        let after = |count: &str| Some(format!("{count} chosen frames are after its last one, 7"));
+        assert_eq!(told(None), (missing("2 of 5"), None));
+        assert_eq!(told(Some("3-10")), (missing("2 of 5"), after("3 of 8")));
+        assert_eq!(told(Some("4,7-9x2")), (None, after("1 of 3")));
+        assert_eq!(told(Some("7")), (None, None));
     }
 }

@@ -9,6 +9,7 @@ use demc_data::output::{OutputError, Outputs};
 
 use super::UsageError;
 use super::inputs::Inputs;
+use super::shard::Shard;
 
 /// One image to denoise.
 #[derive(Debug, PartialEq)]
@@ -81,6 +82,14 @@ impl Jobs {
             skipped: 0,
             kept_previews: 0,
         })
+    }
+
+    /// Keeps the images of one shard.
+    pub fn keep(&mut self, shard: Shard) {
+        // No two have the same name.
+        shard.keep(&mut self.list, |job| {
+            job.input.file_name().map(ToOwned::to_owned)
+        });
     }
 
     /// Notes all files to write. In a directory, existing ones are skipped later.

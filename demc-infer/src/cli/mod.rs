@@ -10,14 +10,17 @@ mod evaluate;
 mod export;
 mod exposure;
 mod flags;
+mod frames;
 mod import;
 mod inputs;
 mod inspect;
 mod jobs;
+mod layers;
 mod layouts;
 mod progress;
 mod report;
 mod scenes;
+mod shard;
 mod warnings;
 
 use std::path::Path;

@@ -7,14 +7,15 @@ use clap::Args;
 use demc_data::message::{self, printable};
 use demc_infer::report::{About, ReportPage};
 
-use super::scenes::Scenes;
+use super::scenes::{Scenes, require_all};
 
 /// Write an HTML report: denoised images beside noisy, reference and baseline images, with all
 /// metrics.
 ///
 /// The report is one file below 20 MB and needs no network. Its images are 8-bit JPEG with a
 /// logarithmic curve, so that the exposure can be changed by 3 stops in both directions. All
-/// numbers are computed from the full images.
+/// numbers are computed from the full images. A scene that cannot be read or scored is reported and
+/// skipped, and the exit code is 1.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer report --data data/sample -o report.html
@@ -35,6 +36,10 @@ impl Arguments {
             |images, scenes| Ok(images.encode(scenes)?),
             |encoded, score| Ok(page.add(encoded, score)?),
         )?;
+        // A page needs an image.
+        if report.images.is_empty() {
+            return require_all(&report);
+        }
         let about = About {
             model: self.scenes.model_name(),
             data: self.scenes.data.display().to_string(),
@@ -49,6 +54,6 @@ impl Arguments {
             html.len() as f64 / 1e6
         );
         message::status(printable(&summary));
-        Ok(())
+        require_all(&report)
     }
 }

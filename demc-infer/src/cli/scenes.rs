@@ -3,14 +3,16 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
+use demc_data::message::printable;
 use demc_data::output::Outputs;
-use demc_data::{Dataset, Rgb, Scene};
-use demc_infer::denoise::DenoiseOptions;
+use demc_data::{ChannelLayout, Dataset, Frame, Rgb, Scene};
+use demc_infer::denoise::{DenoiseError, DenoiseOptions, Denoised};
+use demc_infer::evaluate::FailedImage;
 use demc_infer::report::SceneImages;
 use demc_infer::{Baseline, BaselineError, Ensemble, ImageScore, Report, baseline};
 
 use super::exposure::InputScaleFlag;
-use super::flags::{DeviceFlag, EnsembleFlag, ModelFlag};
+use super::flags::{DeviceFlag, EnsembleFlag, LightFlag, ModelFlag};
 use super::layouts::LayoutFlags;
 use super::progress::Progress;
 use super::{Clamped, UsageError};
@@ -37,6 +39,8 @@ pub struct Scenes {
     #[command(flatten)]
     ensemble: EnsembleFlag,
     #[command(flatten)]
+    light: LightFlag,
+    #[command(flatten)]
     device: DeviceFlag,
 }
 
@@ -53,6 +57,14 @@ impl From<SplitFlag> for demc_data::Split {
             SplitFlag::Test => demc_data::Split::Test,
         }
     }
+}
+
+/// Fails if a scene was not scored.
+pub fn require_all(report: &Report) -> anyhow::Result<()> {
+    let (failed, scored) = (report.failed.len(), report.images.len());
+    let all = failed + scored;
+    anyhow::ensure!(failed == 0, "{failed} of {all} scenes were not scored");
+    Ok(())
 }
 
 impl Scenes {
@@ -86,8 +98,11 @@ impl Scenes {
     /// Scores every scene of the split in all metrics, with one scene in memory at a time.
     ///
     /// In parallel with the scoring, `process` gets the scene's images and the number of all
-    /// scenes. Its result and the scores go to `finish`. A failure ends the run, because a mean
-    /// over fewer scenes would mislead.
+    /// scenes. Its result and the scores go to `finish`. A scene that fails is reported and becomes
+    /// one of the report's failed images.
+    ///
+    /// # Errors
+    /// An invalid model or data set; missing baseline images; what `finish` returns.
     pub fn score<T: Send>(
         &self,
         process: impl Fn(&SceneImages, usize) -> anyhow::Result<T> + Sync,
@@ -105,45 +120,71 @@ impl Scenes {
             other => other.into(),
         })?;
         let progress = Progress::new(scenes.len());
-        let mut images = Vec::with_capacity(scenes.len());
+        let (mut images, mut failed) = (Vec::with_capacity(scenes.len()), Vec::new());
         let mut clamped = Clamped::default();
         let options = DenoiseOptions {
             ensemble: self.ensemble.passes,
             input_scale: self.input_scale.choice.factor(),
+            restore_light: self.light.restore_light,
             ..DenoiseOptions::default()
         };
         for scene in &scenes {
             progress.start(&scene.name);
-            let mut frame = demc_data::read_frame(&scene.path, layout)?;
-            frame.name.clone_from(&scene.name);
-            clamped.count(frame.clamped);
-            let others = self.read_baselines(scene, &mut clamped)?;
-            let others: Vec<_> = self
-                .baselines
-                .iter()
-                .zip(&others)
-                .map(|(baseline, image)| (baseline.name.as_str(), image.planes.as_slice()))
-                .collect();
-            let denoised = bundle.denoise_with(&frame, &options, |_, _| ())?;
-            let denoised = denoised.color_hdr;
-            let residual = scene.ref_residual_relmse;
-            let scene_images = SceneImages {
-                frame: &frame,
-                denoised: &denoised,
-                baselines: &others,
-            };
-            let (score, processed) = rayon::join(
-                || ImageScore::full(&frame, &denoised, &others, residual),
-                || process(&scene_images, scenes.len()),
-            );
-            let score = score?;
-            finish(processed?, &score)?;
-            images.push(score);
+            let denoise = |frame: &Frame| bundle.denoise_with(frame, &options, |_, _| ());
+            let process = |images: &SceneImages| process(images, scenes.len());
+            match self.score_scene(scene, layout, denoise, process, &mut clamped) {
+                Ok((score, processed)) => {
+                    finish(processed, &score)?;
+                    images.push(score);
+                }
+                Err(error) => {
+                    progress.line(format_args!("error: {}: {error:#}", scene.name));
+                    failed.push(FailedImage {
+                        name: scene.name.clone(),
+                        error: printable(&format!("{error:#}")),
+                    });
+                }
+            }
             progress.advance();
         }
         progress.finish();
         clamped.report();
-        Ok(Report::new(images))
+        Ok(Report {
+            failed,
+            ..Report::new(images)
+        })
+    }
+
+    fn score_scene<T: Send>(
+        &self,
+        scene: &Scene,
+        layout: &ChannelLayout,
+        denoise: impl Fn(&Frame) -> Result<Denoised, DenoiseError>,
+        process: impl Fn(&SceneImages) -> anyhow::Result<T> + Sync,
+        clamped: &mut Clamped,
+    ) -> anyhow::Result<(ImageScore, T)> {
+        let mut frame = demc_data::read_frame(&scene.path, layout)?;
+        frame.name.clone_from(&scene.name);
+        clamped.count(frame.clamped);
+        let others = self.read_baselines(scene, clamped)?;
+        let others: Vec<_> = self
+            .baselines
+            .iter()
+            .zip(&others)
+            .map(|(baseline, image)| (baseline.name.as_str(), image.planes.as_slice()))
+            .collect();
+        let denoised = denoise(&frame)?.color_hdr;
+        let residual = scene.ref_residual_relmse;
+        let scene_images = SceneImages {
+            frame: &frame,
+            denoised: &denoised,
+            baselines: &others,
+        };
+        let (score, processed) = rayon::join(
+            || ImageScore::full(&frame, &denoised, &others, residual),
+            || process(&scene_images),
+        );
+        Ok((score?, processed?))
     }
 
     fn read_baselines(&self, scene: &Scene, clamped: &mut Clamped) -> anyhow::Result<Vec<Rgb>> {

@@ -51,11 +51,11 @@ impl FrameInput<'_> {
         let rows = filtered.par_chunks_mut(padded.width).enumerate();
         rows.for_each(|(row, filtered)| {
             let first = (row % padded.height).min(frame.height - 1) * frame.width;
+            let albedo = [0, 1, 2].map(|c| &color[c * pixels + first..][..frame.width]);
             for (column, value) in filtered.iter_mut().enumerate() {
-                let pixel = first + column.min(frame.width - 1);
-                let mut albedo = color[pixel..].iter().step_by(pixels);
+                let column = column.min(frame.width - 1);
                 // Without a surface there is nothing to filter; neighbours would bleed in.
-                *value = match albedo.any(|channel| *channel > 0.0) {
+                *value = match albedo.iter().any(|channel| channel[column] > 0.0) {
                     true => value.min(MAX_ALBEDO),
                     false => 0.0,
                 };

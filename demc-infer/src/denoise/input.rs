@@ -10,6 +10,7 @@ use demc_model::config::COLOR_CHANNELS;
 use rayon::prelude::*;
 
 use super::DenoiseError;
+use super::layers::{Layer, LayerTile};
 use crate::Bundle;
 use crate::ensemble::Ensemble;
 use crate::error::check_sizes;
@@ -27,6 +28,8 @@ pub(super) struct FrameInput<'a> {
     pub(super) frame: &'a Frame,
     /// The image that is denoised, planar `[3, H, W]`: the frame's colour, or its alpha as grey.
     pub(super) color: &'a [f32],
+    /// Channels that are filtered with its kernels.
+    pub(super) layers: &'a [Layer],
     /// The filtered albedo of the first hit, which replaces the frame's: planar, padded `[3, H, W]`.
     pub(super) albedo: Option<Arc<[f32]>>,
     pub(super) padding: Padding,
@@ -62,6 +65,7 @@ impl<'a> FrameInput<'a> {
             bundle,
             frame,
             color: &frame.color,
+            layers: &[],
             albedo: None,
             padding: Padding {
                 height: frame.height,
@@ -86,7 +90,7 @@ impl<'a> FrameInput<'a> {
     /// Denoises tile by tile.
     ///
     /// # Shapes
-    /// Returns planar `[3, H, W]` in linear HDR.
+    /// Returns planar `[3 + layers, H, W]` in linear HDR.
     pub(super) fn denoise(
         &self,
         tiles: &Tiles,
@@ -103,12 +107,18 @@ impl<'a> FrameInput<'a> {
         tiles: &Tiles,
         mut progress: impl FnMut(usize, usize),
     ) -> Result<Vec<f32>, DenoiseError> {
-        let mut out = vec![0.0; COLOR_CHANNELS * size.height * size.width];
+        let mut out = Vec::new();
         let mut bad = 0;
         for (done, (rows, columns)) in tiles.iter().enumerate() {
             progress(done, tiles.count());
             let tile = self.tile(&rows.read, &columns.read)?;
-            bad += tile.iter().filter(|x| !x.is_finite()).count();
+            bad += tile.par_iter().filter(|x| !x.is_finite()).count();
+            if (&rows.read, &columns.read) == (&(0..size.height), &(0..size.width)) {
+                out = tile;
+                continue;
+            }
+            let planes = COLOR_CHANNELS + self.layers.len();
+            out.resize(planes * size.height * size.width, 0.0);
             size.paste(&tile, rows, columns, &mut out);
         }
         match bad {
@@ -159,7 +169,7 @@ impl<'a> FrameInput<'a> {
     /// Denoises one tile. NaN in the network's output stays NaN.
     ///
     /// # Shapes
-    /// Returns `[3, rows, columns]` in linear HDR.
+    /// Returns `[3 + layers, rows, columns]` in linear HDR.
     pub(super) fn tile(
         &self,
         rows: &PixelRange,
@@ -173,11 +183,25 @@ impl<'a> FrameInput<'a> {
             normalizer.color_gamma_from_hdr(color, modulation);
         });
         let color_gamma = self.tensor::<COLOR_CHANNELS>(color, rows, columns);
-        let out = self
-            .ensemble
-            .mean([color_gamma, features_z], |[color, features]| {
-                self.bundle.model.forward(color, features)
-            });
+        let network = &self.bundle.model;
+        let layers = LayerTile::new(
+            self.layers,
+            modulation.as_deref(),
+            normalizer.gamma,
+            [rows, columns],
+        );
+        let (out, filtered) = match self.layers.is_empty() {
+            true => {
+                let inputs = [color_gamma, features_z];
+                let forward = |[color, features]: [Tensor<4>; 2]| network.forward(color, features);
+                (self.ensemble.mean(inputs, forward), None)
+            }
+            false => {
+                let input = layers.input(self.padding, &self.device);
+                let (out, filtered) = network.forward_with_layers(color_gamma, features_z, input);
+                (out, Some(filtered))
+            }
+        };
         let mut out = self.read(out)?;
         in_pieces(&mut out, modulation.as_deref(), |out, modulation| {
             // The conversion to HDR would turn NaN into 0.
@@ -186,6 +210,9 @@ impl<'a> FrameInput<'a> {
             nan.into_iter().for_each(|i| out[i] = f32::NAN);
             out.iter_mut().for_each(|value| *value /= self.scale);
         });
+        if let Some(filtered) = filtered {
+            out.extend(layers.output(self.read(filtered)?));
+        }
         Ok(out)
     }
 

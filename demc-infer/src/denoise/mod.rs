@@ -5,6 +5,10 @@ mod albedo;
 #[cfg(test)]
 mod filter_tests;
 mod input;
+mod layers;
+#[cfg(test)]
+mod layers_tests;
+mod light;
 mod seams;
 #[cfg(test)]
 mod tests;
@@ -21,9 +25,11 @@ use crate::memory;
 use crate::padding::Padding;
 use crate::tiles::{Tiles, Tiling};
 use input::{FrameInput, PixelRange};
+use layers::{check_layer_sizes, layer_images};
 
-pub use crate::error::DenoiseError;
+pub use crate::error::{DenoiseError, LayersError};
 pub use demc_data::transform::MAX_INPUT_SCALE;
+pub use layers::Layer;
 pub use seams::SeamError;
 
 /// Exposures up to this factor outside the training scenes' range are not scaled: a stop, the
@@ -41,6 +47,11 @@ pub struct DenoiseOptions {
     /// Factor on the colour before the network; the output is divided by it. `None`: the image's
     /// own [`Bundle::input_scale`].
     pub input_scale: Option<f32>,
+    /// Whether the output gets the light of the noisy image. `None`: as the model says.
+    pub restore_light: Option<bool>,
+    /// Further channels to filter with the colour's kernels. They need a kernel head, and
+    /// [`Ensemble::One`].
+    pub layers: Vec<Layer>,
 }
 
 /// A denoised image, and how it was made.
@@ -50,6 +61,8 @@ pub struct Denoised {
     pub color_hdr: Vec<f32>,
     /// The denoised alpha `[H, W]`, for a frame whose alpha varies.
     pub alpha: Option<Vec<f32>>,
+    /// The filtered layers `[layers, H, W]`, in the order of the options. Of either sign.
+    pub layers: Vec<f32>,
     /// The tiles that the image was cut into.
     pub tiles: Tiles,
     /// The error of a halo below the exact one, measured at seams; `None` for exact tiles or a
@@ -91,8 +104,19 @@ impl Bundle {
             tiling,
             ensemble,
             input_scale,
+            restore_light,
+            layers,
         } = options;
         let ensemble = *ensemble;
+        let pixels = frame.width * frame.height;
+        if !layers.is_empty() {
+            let checked = self.check_layers(ensemble);
+            let checked = checked.and_then(|()| check_layer_sizes(layers, pixels));
+            checked.map_err(|source| DenoiseError::Layers {
+                name: frame.name.clone(),
+                source,
+            })?;
+        }
         let mut input = FrameInput::new(self, frame)?;
         input.ensemble = ensemble;
         input.scale = match input_scale {
@@ -101,21 +125,39 @@ impl Bundle {
         };
         self.check_statistics(frame)?;
         input.filter_albedo(tiling)?;
+        let size = Padding {
+            height: frame.height,
+            width: frame.width,
+        };
         let tiles = self
-            .tiles_beside(outputs(frame), frame.height, frame.width, tiling, ensemble)
+            .tiles_beside([outputs(frame), layers.len()], size, tiling, ensemble)
             .map_err(|source| DenoiseError::Memory {
                 name: frame.name.clone(),
                 source,
             })?;
-        let color_hdr = input.denoise(&tiles, progress)?;
+        input.layers = layers;
+        let mut color_hdr = input.denoise(&tiles, progress)?;
+        let mut layer_planes = color_hdr.split_off(COLOR_CHANNELS * pixels);
+        input.layers = &[];
         let alpha = input.denoise_alpha(&tiles)?;
         let seam_error = match tiling.is_exact() {
             true => None,
             false => input.seam_error(&tiles, &color_hdr)?,
         };
+        if restore_light.unwrap_or(self.meta.normalizer.restore_light) {
+            let factors = light::factors(&frame.color, &color_hdr, frame.height, frame.width);
+            light::multiply(&mut color_hdr, &factors);
+            let colors = layers.iter().map(Layer::color);
+            for (plane, color) in layer_planes.chunks_mut(pixels).zip(colors) {
+                if let Some(color) = color {
+                    light::multiply(plane, &factors[color * pixels..(color + 1) * pixels]);
+                }
+            }
+        }
         Ok(Denoised {
             color_hdr,
             alpha,
+            layers: layer_planes,
             tiles,
             seam_error,
         })
@@ -174,22 +216,23 @@ impl Bundle {
         tiling: &Tiling,
         ensemble: Ensemble,
     ) -> Result<Tiles, memory::TooLarge> {
-        self.tiles_beside(COLOR_CHANNELS, height, width, tiling, ensemble)
+        let size = Padding { height, width };
+        self.tiles_beside([COLOR_CHANNELS, 0], size, tiling, ensemble)
     }
 
-    /// As [`tiles`](Self::tiles), for an image with this number of output planes.
+    /// As [`tiles`](Self::tiles), for an image with this number of output planes beside the layers.
     fn tiles_beside(
         &self,
-        outputs: usize,
-        height: usize,
-        width: usize,
+        [outputs, layers]: [usize; 2],
+        size: Padding,
         tiling: &Tiling,
         ensemble: Ensemble,
     ) -> Result<Tiles, memory::TooLarge> {
-        let padding = Padding { height, width };
-        let padded = (padding.padded_height(), padding.padded_width());
+        let padded = (size.padded_height(), size.padded_width());
         let budget = tiling.memory.or_else(|| {
-            let output = (outputs * height * width * size_of::<f32>()) as u64;
+            // The layers of all tiles, and again as a plane each.
+            let planes = outputs + 2 * layers;
+            let output = (planes * size.height * size.width * size_of::<f32>()) as u64;
             Some(self.memory_budget()?.saturating_sub(output))
         });
         let modulation = match self.meta.normalizer.albedo_demodulation_epsilon {
@@ -198,15 +241,23 @@ impl Bundle {
         };
         let extra =
             modulation + ensemble.bytes_per_pixel(COLOR_CHANNELS + FEATURES, COLOR_CHANNELS);
-        let need = |height, width| self.pass_bytes(height, width) + extra * (height * width) as u64;
+        let images = layer_images(layers);
+        let need = |height, width| {
+            self.pass_bytes_with(images, height, width) + extra * (height * width) as u64
+        };
         Tiles::plan(padded, tiling, need, budget)
     }
 
     /// Bytes that a pass over `height` x `width` pixels (multiples of 32) needs in addition to the
     /// weights.
     pub fn pass_bytes(&self, height: usize, width: usize) -> u64 {
+        self.pass_bytes_with(0, height, width)
+    }
+
+    /// As [`pass_bytes`](Self::pass_bytes), with this number of images of three layers.
+    fn pass_bytes_with(&self, images: usize, height: usize, width: usize) -> u64 {
         let ops = self.model.ops().on(&self.device());
-        demc_model::inference::pass_bytes(ops, self.model.config(), height, width)
+        demc_model::inference::pass_bytes(ops, self.model.config(), height, width, images)
     }
 
     /// Bytes that a pass may use now on the model's device; `None` if unknown.

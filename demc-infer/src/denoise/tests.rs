@@ -26,6 +26,7 @@ pub(super) fn denoise(
         tiling: *tiling,
         ensemble,
         input_scale: Some(1.0),
+        ..DenoiseOptions::default()
     };
     bundle.denoise_with(frame, &options, |_, _| ())
 }
@@ -284,6 +285,28 @@ fn the_exposure_of_an_unusual_image_does_not_matter() {
     };
     let other = bundle.denoise_with(&frame, &options, |_, _| ());
     assert!(difference(&other.expect("denoised").color_hdr, &expected) > 1e-3);
+}
+
+#[test]
+fn restored_light_is_that_of_the_noisy_image_and_an_option_wins() {
+    let mut bundle = bundle(Variant::Demc);
+    let frame = frame(90, 70);
+    let light = |image: &[f32]| image.iter().map(|x| f64::from(*x)).sum::<f64>();
+    let run = |bundle: &Bundle, restore_light| {
+        let options = DenoiseOptions {
+            restore_light,
+            ..DenoiseOptions::default()
+        };
+        let denoised = bundle.denoise_with(&frame, &options, |_, _| ());
+        denoised.expect("denoised").color_hdr
+    };
+    let plain = run(&bundle, None);
+    let restored = run(&bundle, Some(true));
+    let missing = |image: &[f32]| (light(image) - light(&frame.color)).abs();
+    assert!(missing(&restored) < missing(&plain) - 1.0);
+    bundle.meta.normalizer.restore_light = true;
+    assert!(run(&bundle, None) == restored);
+    assert!(run(&bundle, Some(false)) == plain);
 }
 
 #[test]

@@ -245,16 +245,28 @@ impl MeanScore {
     }
 }
 
+/// An image that was not scored.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FailedImage {
+    /// The image.
+    pub name: String,
+    /// Why, in one line.
+    pub error: String,
+}
+
 /// The scores of several images and their mean.
 ///
 /// [`Display`](std::fmt::Display) gives a Markdown table of RelMSE and SSIM. The JSON is
-/// `{"images": [...], "mean": {...}}`.
+/// `{"images": [...], "mean": {...}}`, and `"failed": [...]` if there are any.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Report {
     /// One entry per image, in the given order.
     pub images: Vec<ImageScore>,
     /// Their mean with equal weights.
     pub mean: MeanScore,
+    /// The images without scores.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub failed: Vec<FailedImage>,
 }
 
 impl Report {
@@ -274,7 +286,11 @@ impl Report {
             denoised: mean(&|image| Some(&image.denoised)),
             baselines: baselines.collect(),
         };
-        Self { images, mean }
+        Self {
+            images,
+            mean,
+            failed: Vec::new(),
+        }
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use demc_data::message::printable;
+use demc_data::message::{list, printable};
 use demc_model::metrics::{METRICS, Metric};
 
 use super::{Report, Score, is_headline};
@@ -22,7 +22,13 @@ impl Report {
             row(&image.name, &metrics, &image.methods(), residual)
         }));
         rows.push(row("mean", &metrics, &methods, None));
-        format!("{}\n{}", aligned(&rows), legend(&metrics))
+        let mut text = format!("{}\n{}", aligned(&rows), legend(&metrics));
+        if !self.failed.is_empty() {
+            let names = self.failed.iter().map(|image| printable(&image.name));
+            let names = list(&names.collect::<Vec<_>>());
+            text += &format!("\nNot scored, and not part of the means: {names}.");
+        }
+        text
     }
 }
 
@@ -119,6 +125,7 @@ fn legend(metrics: &[&Metric]) -> String {
 mod tests {
     use demc_model::metrics;
 
+    use super::super::FailedImage;
     use super::super::tests::image;
     use super::*;
 
@@ -139,6 +146,23 @@ mod tests {
             "{table}"
         );
         assert!(lines[4].starts_with("| mean "), "{table}");
+    }
+
+    #[test]
+    fn images_without_scores_are_named_below_the_table() {
+        let mut report = Report::new(vec![image("a", 1.0, None)]);
+        assert!(!report.to_string().contains("Not scored"));
+        report.failed = ["b", "c\n"].map(failed).into();
+        let table = report.to_string();
+        let end = "\nNot scored, and not part of the means: b, c\\n.";
+        assert!(table.ends_with(end), "{table}");
+    }
+
+    fn failed(name: &str) -> FailedImage {
+        FailedImage {
+            name: name.into(),
+            error: "damaged".into(),
+        }
     }
 
     #[test]

@@ -106,6 +106,7 @@ impl ReportPage {
             "metrics": metrics.collect::<Vec<_>>(),
             "methods": names,
             "images": self.images,
+            "failed": report.failed,
             "mean": by_name(&methods)?,
             "differences": report.differences(),
             "fewImages": FEW_IMAGES,

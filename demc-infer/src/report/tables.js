@@ -22,6 +22,10 @@
     const mean = residuals.reduce((a, b) => a + b) / residuals.length;
     byId("residual").textContent = `The references contain noise: their mean relmse against a noise-free image is ${number(mean)}. A score near that value has no meaning.`;
   }
+  if (data.failed.length) {
+    const failed = data.failed.map((image) => `${image.name} (${image.error})`).join("; ");
+    byId("failed").textContent = `Not scored, and not part of the means: ${failed}.`;
+  }
 
   // Scores per image.
   const rows = data.images.flatMap((image, i) => data.methods.map((method) => ({ image: image.name, i, method, residual: image.residual, scores: image.scores[method] })));

@@ -8,7 +8,7 @@ use std::process::{Command, Output};
 use burn::tensor::Device;
 use demc_data::{ChannelLayout, FeatureStats, Normalizer, PositionSpace};
 use demc_infer::{Bundle, BundleMeta, Names, Precision};
-use demc_model::{ModelConfig, Reading, Variant};
+use demc_model::{Head, ModelConfig, Reading, Variant};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use tempfile::TempDir;
@@ -23,19 +23,35 @@ pub fn run_directory() -> TempDir {
     directory
 }
 
+/// As [`run_directory`], with a kernel head and albedo demodulation.
+pub fn kernel_run_directory() -> TempDir {
+    let directory = tempfile::tempdir().expect("directory");
+    let path = directory.path().join("best.safetensors");
+    bundle_with(Head::Kernel, Some(0.07))
+        .save(&path, Names::Burn, Precision::F32)
+        .expect("saved");
+    directory
+}
+
 /// A random network in the released reading, with batch normalisation in the decoder.
 pub fn random_bundle() -> Bundle {
+    bundle_with(Head::default(), None)
+}
+
+fn bundle_with(head: Head, albedo_demodulation_epsilon: Option<f32>) -> Bundle {
     let model = ModelConfig {
         variant: Variant::Demc,
         reading: Reading::Released,
         width: 2,
+        head,
         ..ModelConfig::default()
     };
     let normalizer = Normalizer {
         gamma: 2.2,
-        albedo_demodulation_epsilon: None,
+        albedo_demodulation_epsilon,
         position: PositionSpace::Scene,
         exposure_level: None,
+        restore_light: false,
         features: FeatureStats {
             mean: [0.2; 12],
             std: [0.7; 12],
