@@ -95,8 +95,11 @@ CHANNELS = [*"RGB", *(f"{buffer}.{axis}" for buffer in ("normal", "position") fo
 
 
 def write_exr(path, side=64, **values):
-    """Writes a square, uncompressed image with the channels of the layout demc-exr. The samples of a channel vary around 0.5; a keyword (`R`, `normal`, `ref`) replaces those
-    of one channel or buffer by a constant."""
+    """Writes a square, uncompressed image with the channels of the layout demc-exr.
+
+    The samples of a channel vary around 0.5. A keyword (`R`, `normal`, `ref`) replaces those of one channel or buffer
+    by a constant, or by a function of x and y.
+    """
     def attribute(name, kind, data):
         return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(data)) + data
 
@@ -122,7 +125,8 @@ def write_exr(path, side=64, **values):
         line = []
         for number, name in enumerate(names):
             value = values.get(name, values.get(name.split(".")[0]))
-            line += ([value] * side if value is not None else
+            line += ([value(x, y) for x in range(side)] if callable(value) else
+                     [value] * side if value is not None else
                      [0.3 + ((x * 7 + y * 13 + number * 29) % 41) / 100 for x in range(side)])
         lines.append(struct.pack("<ii", y, size - 8) + struct.pack(f"<{len(line)}f", *line))
     path.write_bytes(header + offsets + b"".join(lines))

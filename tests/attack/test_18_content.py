@@ -6,7 +6,10 @@ from common import Attack, write_exr, write_manifest
 
 WHOLE = "configuration and data are valid"
 PROBLEMS = [({"R": 0.0, "G": 0.0, "B": 0.0}, "the noisy image is black"), ({"ref": 0.0}, "the reference is black"),
-            ({"ref": 1e30}, "the reference has values above 1e15"), ({"normal": 0.0}, "normal is constant"),
+            ({"R": 1e30, "G": 1e30, "B": 1e30}, "the noisy image has only values above 1e15"),
+            ({"ref": 1e30}, "the reference has only values above 1e15"),
+            ({"ref": lambda x, y: 1e30 if x == y else 0.5}, "the reference has values above 1e15"),
+            ({"R": 1e30}, "the noisy image has values above 1e15"), ({"normal": 0.0}, "normal is constant"),
             ({"position": 0.0}, "position is constant"), ({"albedo1": 0.0}, "texture1 is constant"),
             ({"albedo2": 0.0}, "texture2 is constant")]
 
@@ -28,10 +31,12 @@ class Content(Attack):
                                 "--set", "data.root=mine", *options)
 
     def test_18_check_warns(self):
+        # With 0.3, one of three training scenes is held out.
+        self.list(("one", "train", "one"), ("two", "train", "two"), ("four", "train", "four"), ("three", "test", "three"))
         result = self.train("--check")
         self.assertIn(WHOLE, result.stdout, result)
         self.assertNotIn("warning", result.stdout)
-        for validation in ("0.0", "0.5"):
+        for validation in ("0.0", "0.3"):
             for values, words in PROBLEMS:
                 for name in ("one", "two", "three"):
                     path = self.data / f"{name}.exr"
@@ -44,11 +49,40 @@ class Content(Attack):
                         self.assertNotIn(WHOLE, result.stdout)
                     path.write_bytes(whole)
 
-    def test_18_a_zero_loss(self):
+    def test_18_scenes_without_content_are_refused(self):
+        """If no training scene can be learned from, nothing starts. One usable scene suffices."""
+        fatal = [(values, words) for values, words in PROBLEMS if "black" in words or "only" in words]
+        self.assertEqual(len(fatal), 4)
+        commands = (["--check"], [], ["--set", "data.validation=0.5", "--check"])
+        for number, (values, words) in enumerate(fatal):
+            other = fatal[number - 1][0]
+            for second, is_refused in ((values, True), (other, True), ({"normal": 0.0}, False)):
+                write_exr(self.data / "one.exr", **values)
+                write_exr(self.data / "two.exr", **second)
+                write_exr(self.data / "three.exr", **values)
+                for options in commands[:2] if is_refused else commands[::2]:
+                    result = self.train(*options)
+                    with self.subTest(words=words, second=second, options=options):
+                        if is_refused:
+                            self.assert_refused(result, "no training scene can be learned from", f"{words}: ", "one")
+                            self.assertEqual(result.stderr.count("\n"), 1, result)
+                            self.assertFalse((self.root / "r").exists())
+                        elif "data.validation=0.5" not in options:
+                            self.assertEqual(result.code, 0, result)
+                            self.assertIn(f"warning: {words}: one, three", result.stdout)
+                sweep = self.run_program("demc-train", "find-lr", "--config", "tiny.toml", "--set", "data.root=mine",
+                                         "--steps", "10", "-o", "sweep") if is_refused else None
+                if sweep:
+                    self.assert_refused(sweep, "no training scene can be learned from")
+
+    def test_18_a_tiny_loss(self):
+        """Scenes with content, of which no patch is lit: the loss is nearly 0."""
+        corner = lambda x, y: float(x == y == 63)
         for name in ("one", "two", "three", "four"):
-            write_exr(self.data / f"{name}.exr", R=0.0, G=0.0, B=0.0, ref=0.0)
+            write_exr(self.data / f"{name}.exr", R=corner, G=0.0, B=0.0, ref=corner)
         self.list(*((name, "train", name) for name in ("one", "two", "three", "four")))
-        result = self.train("--set", "train.steps=300", "--set", "run.log_every=300", "--set", "data.validation=0")
+        result = self.train("--set", "train.steps=300", "--set", "run.log_every=300", "--set", "data.validation=0",
+                            "--set", "data.border=drop")
         self.assertEqual(result.code, 0, result)
         for words in ("NaN", "brings", "0.0000 over"):
             self.assertNotIn(words, result.stdout)

@@ -11,6 +11,13 @@ import outputs
 DEAD = 4199999999  # Above the largest process id.
 
 
+def temporary(name, process):
+    """What a process of this computer calls the file while it writes it (`demc_data::file`)."""
+    with open("/proc/sys/kernel/random/boot_id") as boot:
+        host = f"{boot.read(8)}-{os.stat('/proc/self/ns/pid').st_ino}"
+    return f".{name}.{host}-{process}.tmp"
+
+
 class Outputs(Attack):
     def setUp(self):
         super().setUp()
@@ -218,11 +225,12 @@ class Outputs(Attack):
             with self.subTest(output=output.name):
                 path = self.root / output.file
                 folder = self.make_place(output, output.file)
-                stale = folder / f".{path.name}.{DEAD}.tmp"
-                other = folder / f".mine.{DEAD}.tmp"
-                living = folder / f".{path.name}.{os.getpid()}.tmp"
-                locked = folder / f".{path.name}.{DEAD - 1}.tmp"
-                for file in (stale, other, living, locked):
+                stale = folder / temporary(path.name, DEAD)
+                other = folder / temporary("mine", DEAD)
+                living = folder / temporary(path.name, os.getpid())
+                locked = folder / temporary(path.name, DEAD - 1)
+                elsewhere = folder / f".{path.name}.0badc0de-1-{DEAD}.tmp"
+                for file in (stale, other, living, locked, elsewhere):
                     file.write_bytes(b"half")
                 more = ["--overwrite"] * output.overwrite
                 with open(locked, "rb+") as lock:
@@ -230,7 +238,7 @@ class Outputs(Attack):
                     result = self.run_output(output, None, *more)
                 self.assertEqual(result.code, 0, result)
                 self.assertFalse(stale.exists())
-                self.assertTrue(living.exists() and locked.exists())
+                self.assertTrue(living.exists() and locked.exists() and elsewhere.exists())
                 if not output.name.startswith("train"):
                     self.assertTrue(other.exists())
                 if output.name.startswith("train"):

@@ -104,6 +104,7 @@ fn verify_accepts_pytorch_with_either_style_of_names() {
             bundle.meta.ranges = statistics.ranges;
             bundle.meta.normalizer = Normalizer {
                 position: PositionSpace::Image,
+                restore_light: true,
                 ..statistics.normalizer
             };
         }

@@ -132,6 +132,7 @@ pub fn random_bundle(
         },
         position: PositionSpace::Scene,
         exposure_level: None,
+        restore_light: false,
         features: FeatureStats {
             mean: std::array::from_fn(|channel| 0.3 * channel as f32 - 1.0),
             std: std::array::from_fn(|channel| 0.4 + 0.5 * channel as f32),
