@@ -98,21 +98,19 @@ impl Plane {
 
     /// The largest sample; minus infinity for an empty plane.
     pub fn max(&self) -> f32 {
-        let least = f32::NEG_INFINITY;
-        match self {
-            Plane::Half(samples) => samples.iter().map(|x| x.to_f32()).fold(least, f32::max),
-            Plane::Float(samples) => samples.iter().copied().fold(least, f32::max),
-            Plane::Uint(samples) => samples.iter().max().map_or(least, |x| *x as f32),
-        }
+        self.fold(f32::NEG_INFINITY, f32::max)
     }
 
     /// The smallest sample; infinity for an empty plane.
     pub fn min(&self) -> f32 {
-        let most = f32::INFINITY;
+        self.fold(f32::INFINITY, f32::min)
+    }
+
+    fn fold(&self, first: f32, choose: impl Fn(f32, f32) -> f32) -> f32 {
         match self {
-            Plane::Half(samples) => samples.iter().map(|x| x.to_f32()).fold(most, f32::min),
-            Plane::Float(samples) => samples.iter().copied().fold(most, f32::min),
-            Plane::Uint(samples) => samples.iter().min().map_or(most, |x| *x as f32),
+            Plane::Half(samples) => samples.iter().map(|x| x.to_f32()).fold(first, choose),
+            Plane::Float(samples) => samples.iter().copied().fold(first, choose),
+            Plane::Uint(samples) => samples.iter().map(|x| *x as f32).fold(first, choose),
         }
     }
 

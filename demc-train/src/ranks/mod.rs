@@ -11,10 +11,10 @@ mod group;
 #[cfg(not(feature = "mpi"))]
 #[path = "no_group.rs"]
 mod group;
+mod placement;
 pub mod tree;
 
 use std::cell::Cell;
-use std::fmt;
 use std::ops::Range;
 use std::rc::Rc;
 use std::time::{Duration, Instant};
@@ -24,12 +24,13 @@ use demc_data::message::UsageError;
 use demc_data::output::OutputError;
 use demc_infer::compute::IsaError;
 use demc_infer::device::DeviceError;
+use serde::Serialize;
 use serde::de::DeserializeOwned;
-use serde::{Deserialize, Serialize};
 
 use crate::config::ConfigError;
 use group::Group;
 pub use group::{Launch, abort};
+use placement::{Place, Placement};
 use tree::{Block, PairwiseSum};
 
 /// The ranks of one run. Clones share them.
@@ -52,17 +53,6 @@ pub struct OnNode {
 
 /// A rank without others on its node.
 const ALONE: OnNode = OnNode { rank: 0, count: 1 };
-
-/// Where a rank runs.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-struct Place {
-    /// Name of its node.
-    node: String,
-    /// Its threads.
-    threads: usize,
-    /// Its device.
-    device: String,
-}
 
 /// An error that all ranks know of. Rank 0 prints it.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -359,36 +349,6 @@ fn exchanged(
     Some(group.gather_floats(&total, &counts))
 }
 
-/// The places of all ranks, and the number of gradient values.
-struct Placement<'a>(&'a [Place], u64);
-
-impl fmt::Display for Placement<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Placement(places, floats) = self;
-        let distinct = |of: fn(&Place) -> String| {
-            let mut texts: Vec<String> = places.iter().map(of).collect();
-            texts.sort();
-            texts.dedup();
-            texts
-        };
-        let nodes = distinct(|place| place.node.clone());
-        let threads = distinct(|place| place.threads.to_string());
-        let devices = distinct(|place| place.device.clone());
-        let count = places.len() as f64;
-        let bytes = 2.0 * (count - 1.0) / count * *floats as f64 * 4.0;
-        write!(
-            f,
-            "{} ranks on {} node(s) ({}), threads per rank: {}, device: {}, each sends {:.1} MB per step",
-            places.len(),
-            nodes.len(),
-            demc_data::message::short_list(&nodes),
-            threads.join(" or "),
-            devices.join(", "),
-            bytes / 1e6
-        )
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -407,19 +367,5 @@ mod tests {
         assert_eq!(ranks.sum(blocks, 3), Some(vec![7.0]));
         let error = ranks.agree::<()>(Err(UsageError("no".into()).into()));
         assert_eq!(exit_code(&error.expect_err("its own")), 2);
-    }
-
-    #[test]
-    fn the_line_names_what_differs() {
-        let place = |node: &str, threads: usize| Place {
-            node: node.into(),
-            threads,
-            device: "flex".into(),
-        };
-        let places = [place("b", 2), place("a", 2), place("b", 4), place("a", 2)];
-        assert_eq!(
-            Placement(&places, 1_000_000).to_string(),
-            "4 ranks on 2 node(s) (a, b), threads per rank: 2 or 4, device: flex, each sends 6.0 MB per step"
-        );
     }
 }

@@ -1,14 +1,14 @@
 //! The training loop.
 
+mod scores;
+
 use std::sync::Arc;
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{bail, ensure};
 use burn::module::Module;
 use burn::tensor::Device;
 use demc_data::PatchSource;
-use demc_infer::bundle::locate::BEST;
-use demc_infer::bundle::{Bundle, Names, Precision};
-use demc_infer::evaluate::Report;
+use demc_infer::bundle::Bundle;
 use demc_model::Denoiser;
 
 use crate::config::{Config, OnNan};
@@ -16,15 +16,13 @@ use crate::ranks::Ranks;
 use crate::record::metrics_log::MetricsLine;
 use crate::record::recorder::{Recorder, timed};
 use crate::run::checkpoint::store::CheckpointStore;
-use crate::run::checkpoint::{
-    self, BestValidation, Checkpoint, LoopState, MetricSums, SessionClock,
-};
+use crate::run::checkpoint::{self, Checkpoint, LoopState, MetricSums, SessionClock};
 use crate::run::data::{RunData, rank_loader};
 use crate::run::initial::{InitialNetwork, InitialWeights, initial_network};
-use crate::run::run_dir::{RunDir, SCORES};
+use crate::run::run_dir::RunDir;
 use crate::run::run_record::RunFacts;
 use crate::run::signals::Signals;
-use crate::run::validation::{self, Validation};
+use crate::run::validation::Validation;
 use crate::run::warnings::LoopFacts;
 use crate::step::optimizer::{DormantChannels, Optimizer};
 use crate::step::trainer::{StepReport, Trainer};
@@ -342,29 +340,6 @@ impl TrainingRun {
         )
     }
 
-    /// Scores and draws the validation scenes, and keeps the weights if they are the best so far.
-    fn validate(&mut self, recorder: &mut Recorder) -> anyhow::Result<Option<Validation>> {
-        if self.data.validation.is_empty() || self.is_untrained() {
-            return Ok(None);
-        }
-        let bundle = self.bundle(self.trainer.result());
-        let strips = validation::STRIP_SCENES;
-        let found = validation::score(&bundle, &self.data.validation, strips, &self.ranks)
-            .context("validation")?;
-        let step = self.state.step;
-        if let Some(picture) = &found.picture {
-            recorder.picture(step, picture)?;
-        }
-        let relmse = found.report.mean.denoised.relmse;
-        if self.state.best.is_none_or(|best| relmse < best.relmse) {
-            if self.ranks.is_first() {
-                bundle.save(&self.dir.path().join(BEST), Names::Burn, Precision::F32)?;
-            }
-            self.state.best = Some(BestValidation { step, relmse });
-        }
-        Ok(Some(found))
-    }
-
     /// One sentence on which weights the run keeps, and why.
     pub fn kept_weights(&self) -> String {
         self.state.kept_weights(self.config.train.steps)
@@ -402,32 +377,5 @@ impl TrainingRun {
             model,
             albedo_filter: self.albedo_filter.clone(),
         }
-    }
-
-    /// Scores the test split with the kept weights; `None` without test scenes. Writes `test.json`
-    /// and `strips/test.png`.
-    ///
-    /// # Errors
-    /// A scene that cannot be read; a file that cannot be written.
-    pub fn test(&self, device: &Device) -> anyhow::Result<Option<(u64, Report)>> {
-        if self.data.test.is_empty() {
-            return Ok(None);
-        }
-        let bundle = match self.state.best {
-            Some(_) => Bundle::load(&self.dir.path().join(BEST), device)?,
-            None => self.bundle(self.trainer.result()),
-        };
-        let Validation {
-            report, picture, ..
-        } = validation::score(&bundle, &self.data.test, usize::MAX, &self.ranks).context("test")?;
-        if !self.ranks.is_first() {
-            return Ok(Some((bundle.meta.step, report)));
-        }
-        if let Some(picture) = picture {
-            validation::write_strip(self.dir.path(), "test.png", &picture)?;
-        }
-        self.dir
-            .write(SCORES, &serde_json::to_vec_pretty(&report)?)?;
-        Ok(Some((bundle.meta.step, report)))
     }
 }
