@@ -19,7 +19,7 @@ use demc_data::Frame;
 use demc_data::exr::ExrFile;
 use demc_data::exr::rewrite::{WriteOptions, rewrite};
 use demc_data::frame::{decode_input, read_input};
-use demc_infer::denoise::DenoiseOptions;
+use demc_infer::denoise::{DenoiseOptions, unobserved};
 use demc_infer::{Bundle, Ensemble, Tiling};
 
 #[global_allocator]
@@ -75,7 +75,7 @@ fn tiles(bundle: &Bundle, frame: &Frame) -> anyhow::Result<()> {
             tiling: *tiling,
             ..DenoiseOptions::default()
         };
-        let denoised = bundle.denoise_with(frame, &options, |_, _| ());
+        let denoised = bundle.denoise_with(frame, &options, unobserved);
         std::hint::black_box(denoised.expect("it fits"));
     };
     let turns = interleaved(
@@ -178,15 +178,11 @@ fn repeated(frame: &Frame) -> Frame {
             })
             .collect()
     };
-    Frame {
-        name: "repeated".into(),
-        width: WIDTH,
-        height: HEIGHT,
-        color: planes(&frame.color),
-        features: planes(&frame.features),
-        reference: None,
-        mask: None,
-        alpha: None,
-        clamped: 0,
-    }
+    Frame::new(
+        "repeated",
+        WIDTH,
+        HEIGHT,
+        planes(&frame.color),
+        planes(&frame.features),
+    )
 }

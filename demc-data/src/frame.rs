@@ -45,6 +45,7 @@ pub const FEATURE_NAMES: [&str; FEATURES] = [
 
 /// An image and its buffers as planar `f32`, in the renderer's own units.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub struct Frame {
     /// The file's name without directory and extension.
     pub name: String,
@@ -65,6 +66,33 @@ pub struct Frame {
     pub alpha: Option<Vec<f32>>,
     /// Number of negative samples of colour and reference that were set to 0.
     pub clamped: usize,
+}
+
+impl Frame {
+    /// A frame without reference, mask, and alpha. Its buffers are checked when it is denoised.
+    ///
+    /// # Shapes
+    /// `color` `[3, H, W]` in linear radiance, `features` `[12, H, W]` in the order of
+    /// [`FEATURE_NAMES`].
+    pub fn new(
+        name: impl Into<String>,
+        width: usize,
+        height: usize,
+        color: Vec<f32>,
+        features: Vec<f32>,
+    ) -> Self {
+        Self {
+            name: name.into(),
+            width,
+            height,
+            color,
+            features,
+            reference: None,
+            mask: None,
+            alpha: None,
+            clamped: 0,
+        }
+    }
 }
 
 /// Reads and checks an image. Reference and mask are read if present.

@@ -25,6 +25,8 @@ pub mod batch;
 pub mod cache;
 pub mod channel;
 pub mod checksum;
+#[cfg(feature = "cli")]
+pub mod cli;
 pub mod config;
 pub mod content;
 pub mod dataset;

@@ -23,6 +23,15 @@ const FEW_NAMES: usize = 5;
 #[error("{0}")]
 pub struct UsageError(pub String);
 
+/// Prints what the parser of the command line has to say: help on stdout, errors on stderr. Returns
+/// the exit code.
+#[cfg(feature = "cli")]
+pub fn usage(shown: &clap::Error) -> u8 {
+    // A closed stream ends no program.
+    let _ = shown.print();
+    u8::try_from(shown.exit_code()).unwrap_or(2)
+}
+
 /// Whether a terminal would obey the character instead of showing it: control characters, line
 /// separators, and marks that change the direction of text.
 fn is_hidden(c: char) -> bool {

@@ -153,17 +153,13 @@ mod tests {
     use super::*;
 
     fn frame(color: f32, feature: f32) -> Frame {
-        Frame {
-            name: "flat".into(),
-            width: 4,
-            height: 2,
-            color: vec![color; 24],
-            features: (0..12 * 8).map(|i| feature + (i % 2) as f32).collect(),
-            reference: None,
-            mask: None,
-            alpha: None,
-            clamped: 0,
-        }
+        Frame::new(
+            "flat",
+            4,
+            2,
+            vec![color; 24],
+            (0..12 * 8).map(|i| feature + (i % 2) as f32).collect(),
+        )
     }
 
     #[test]

@@ -73,17 +73,7 @@ fn render() -> Frame {
             }
         }
     }
-    Frame {
-        name: "room".into(),
-        width: WIDTH,
-        height: HEIGHT,
-        color,
-        features,
-        reference: None,
-        mask: None,
-        alpha: None,
-        clamped: 0,
-    }
+    Frame::new("room", WIDTH, HEIGHT, color, features)
 }
 
 /// Position, normal and albedo at the first hit of a ray from the camera.

@@ -36,28 +36,30 @@ impl Ensemble {
         }
     }
 
-    /// Applies `denoise` to every copy of `images` and returns the mean.
+    /// Applies `denoise` to every copy of `images` and returns the mean, or the first error.
     ///
     /// # Shapes
     /// All images and the mean are `[B, channels, H, W]`.
-    pub(crate) fn mean<const N: usize>(
+    pub(crate) fn mean<const N: usize, E>(
         self,
         images: [Tensor<4>; N],
-        denoise: impl Fn([Tensor<4>; N]) -> Tensor<4>,
-    ) -> Tensor<4> {
+        mut denoise: impl FnMut([Tensor<4>; N]) -> Result<Tensor<4>, E>,
+    ) -> Result<Tensor<4>, E> {
         if self == Ensemble::One {
             // No clones: the network frees its inputs early.
             return denoise(images);
         }
-        let symmetries = (0..self.count()).map(Symmetry);
-        let sum = symmetries
-            .map(|symmetry| {
-                let copies = images.clone().map(|image| symmetry.apply(image));
-                symmetry.undo(denoise(copies))
-            })
-            .reduce(|sum, image| sum + image)
-            .expect("four or eight symmetries");
-        sum.div_scalar(self.count() as f32)
+        let mut sum: Option<Tensor<4>> = None;
+        for symmetry in (0..self.count()).map(Symmetry) {
+            let copies = images.clone().map(|image| symmetry.apply(image));
+            let image = symmetry.undo(denoise(copies)?);
+            sum = Some(match sum {
+                None => image,
+                Some(sum) => sum + image,
+            });
+        }
+        let sum = sum.expect("four or eight symmetries");
+        Ok(sum.div_scalar(self.count() as f32))
     }
 
     /// Bytes per pixel that augmentation needs in addition to a pass: the copies of the images, the
@@ -156,10 +158,12 @@ mod tests {
             let first_row = |[image]: [Tensor<4>; 1]| {
                 let [b, c, _, width] = image.dims();
                 let row = Tensor::ones([b, c, 1, width], &image.device());
-                Tensor::zeros_like(&image).slice_assign([0..b, 0..c, 0..1, 0..width], row)
+                Ok::<_, ()>(
+                    Tensor::zeros_like(&image).slice_assign([0..b, 0..c, 0..1, 0..width], row),
+                )
             };
             let zeros = Tensor::zeros([1, 1, 3, 5], &Device::flex());
-            let mean = host(ensemble.mean([zeros], first_row));
+            let mean = host(ensemble.mean([zeros], first_row).expect("no error"));
             let at = |row: usize, column: usize| mean[5 * row + column];
             assert_eq!([at(0, 2), at(2, 2), at(1, 0)], borders, "{ensemble:?}");
             assert_eq!((at(1, 4), at(1, 2)), (borders[2], 0.0), "{ensemble:?}");

@@ -70,6 +70,9 @@ pub enum DenoiseError {
         name: String,
         source: TensorReadError,
     },
+    /// The observer stopped the work.
+    #[error("{name}: cancelled")]
+    Cancelled { name: String },
     /// An image with NaN or infinite values has no score.
     #[error("{name}: {what}")]
     Image {

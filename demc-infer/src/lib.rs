@@ -18,17 +18,7 @@
 //! // Normal xyz, position xyz, albedo rgb of the first and of the second hit.
 //! let features = vec![0.5; 12 * width * height];
 //!
-//! let frame = Frame {
-//!     name: "frame 1".into(),
-//!     width,
-//!     height,
-//!     color,
-//!     features,
-//!     reference: None,
-//!     mask: None,
-//!     alpha: None,
-//!     clamped: 0,
-//! };
+//! let frame = Frame::new("frame 1", width, height, color, features);
 //!
 //! for warning in bundle.warnings(&frame)? {
 //!     eprintln!("warning: {warning}");
@@ -42,6 +32,7 @@
 //!
 //! - [`bundle`]: a [`Bundle`] is a network with its configuration, normalisation statistics,
 //!   channel layout and training step. This module alone reads and writes its file.
+//! - [`buffers`]: images in a caller's memory, with any strides, as a frame.
 //! - [`denoise`]: denoises a frame of the size of any file, with [`padding`], [`tiles`] that fit into
 //!   the available [`memory`], and optional test-time augmentation ([`ensemble`](mod@ensemble)).
 //! - [`guard`]: compares an image with the training data, then refuses it or warns.
@@ -57,7 +48,10 @@
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod baseline;
+pub mod buffers;
 pub mod bundle;
+#[cfg(feature = "cli")]
+pub mod cli;
 pub mod compute;
 pub mod denoise;
 pub mod device;

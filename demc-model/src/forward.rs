@@ -1,12 +1,14 @@
 //! The forward pass of the whole network (Fig. 3), operation by operation or by
 //! [`crate::inference`].
 
+use std::ops::ControlFlow;
+
 use burn::tensor::{Device, Tensor};
 
 use crate::config::{COLOR_CHANNELS, DOWNSAMPLING, FEATURE_CHANNELS, Input, LEVELS};
 use crate::denoiser::Denoiser;
 use crate::encoder::EncoderOutput;
-use crate::inference;
+use crate::inference::{self, Cancelled, Observer};
 use crate::ops::Maps;
 
 impl Denoiser {
@@ -22,7 +24,8 @@ impl Denoiser {
     /// # Panics
     /// If the tensors have other shapes.
     pub fn forward(&self, color_gamma: Tensor<4>, features_z: Tensor<4>) -> Tensor<4> {
-        self.run(color_gamma, features_z, None).0
+        let done = self.forward_observed(color_gamma, features_z, None, &mut never_cancelled);
+        done.expect("nobody cancels").0
     }
 
     /// As [`forward`](Self::forward), for one image without autodiff. The kernels of a kernel head
@@ -40,29 +43,55 @@ impl Denoiser {
         features_z: Tensor<4>,
         layers: Tensor<4>,
     ) -> (Tensor<4>, Tensor<4>) {
-        assert!(self.decoder.head.is_none(), "layers need a kernel head");
-        let [batch, colors, height, width] = color_gamma.dims();
-        let [count, ..] = layers.dims();
-        assert!(batch == 1 && count > 0, "layers of one image");
-        assert_eq!(
-            layers.dims(),
-            [count, colors, height, width],
-            "layers have the channels and the size of color_gamma"
-        );
-        let (color, layers) = self.run(color_gamma, features_z, Some(layers));
+        let layers = Some(layers);
+        let done = self.forward_observed(color_gamma, features_z, layers, &mut never_cancelled);
+        let (color, layers) = done.expect("nobody cancels");
         (color, layers.expect("a kernel head filters layers"))
     }
 
-    fn run(
+    /// As [`forward`](Self::forward) or [`forward_with_layers`](Self::forward_with_layers). On the
+    /// CPU's kernels, `observer` hears of every band of rows; elsewhere of nothing.
+    ///
+    /// # Errors
+    /// The observer stopped the pass.
+    ///
+    /// # Panics
+    /// As these two.
+    pub fn forward_observed(
+        &self,
+        color_gamma: Tensor<4>,
+        features_z: Tensor<4>,
+        layers: Option<Tensor<4>>,
+        observer: &mut Observer,
+    ) -> Result<(Tensor<4>, Option<Tensor<4>>), Cancelled> {
+        assert_shapes(color_gamma.dims(), features_z.dims());
+        if let Some(layers) = &layers {
+            self.assert_layers(color_gamma.dims(), layers.dims());
+        }
+        match self.infers_on(&color_gamma.device()) {
+            true => inference::forward(self, color_gamma, features_z, layers, observer),
+            false => Ok(self.run_modules(color_gamma, features_z, layers)),
+        }
+    }
+
+    fn assert_layers(&self, color_gamma: [usize; 4], layers: [usize; 4]) {
+        assert!(self.decoder.head.is_none(), "layers need a kernel head");
+        let [batch, colors, height, width] = color_gamma;
+        let [count, ..] = layers;
+        assert!(batch == 1 && count > 0, "layers of one image");
+        assert_eq!(
+            layers,
+            [count, colors, height, width],
+            "layers have the channels and the size of color_gamma"
+        );
+    }
+
+    fn run_modules(
         &self,
         color_gamma: Tensor<4>,
         features_z: Tensor<4>,
         layers: Option<Tensor<4>>,
     ) -> (Tensor<4>, Option<Tensor<4>>) {
-        assert_shapes(color_gamma.dims(), features_z.dims());
-        if self.infers_on(&color_gamma.device()) {
-            return inference::forward(self, color_gamma, features_z, layers);
-        }
         let layers = layers.map(|layers| Maps::from_nchw(layers, self.ops()));
         let color_gamma = Maps::from_nchw(color_gamma, self.ops());
         let features_z = Maps::from_nchw(features_z, self.ops());
@@ -114,6 +143,11 @@ impl Denoiser {
         let differentiates = device.is_autodiff() || weights.is_autodiff();
         self.ops().on(device).has_fast_inference() && !differentiates
     }
+}
+
+/// An observer that lets a pass finish.
+fn never_cancelled(_: f64) -> ControlFlow<()> {
+    ControlFlow::Continue(())
 }
 
 /// The skips by level for the decoder: one list per level, deepest first, with one entry per

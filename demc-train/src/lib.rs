@@ -11,6 +11,7 @@
 //! - [`tools`] compares variants, finds learning rates and draws charts.
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
+pub mod cli;
 pub mod config;
 pub mod ranks;
 pub mod record;

@@ -175,18 +175,14 @@ fn frames([batch, height, width]: [usize; 3], bundle: &Bundle, rng: &mut ChaCha8
             let (mean, std) = (statistics.mean[channel], statistics.std[channel]);
             plane.iter_mut().for_each(|x| *x = mean + std * *x);
         }
-        Frame {
-            name: "random".into(),
+        // Values below 0 stay, because graph and program clamp them.
+        Frame::new(
+            "random",
             width,
             height,
-            // Values below 0 stay, because graph and program clamp them.
-            color: color.map(|x| x * x * x).collect(),
+            color.map(|x| x * x * x).collect(),
             features,
-            reference: None,
-            mask: None,
-            alpha: None,
-            clamped: 0,
-        }
+        )
     };
     (0..batch).map(|_| frame()).collect()
 }

@@ -129,17 +129,13 @@ fn weights_trained_in_pytorch_are_imported() {
             let channel = i / (SIDE * SIDE);
             statistics.mean[channel] + statistics.std[channel] * z
         });
-        let frame = Frame {
-            name: "random".into(),
-            width: SIDE,
-            height: SIDE,
-            color: uniform(0.0, 1.0, 3 * SIDE * SIDE, &mut rng),
-            features: raw.collect(),
-            reference: None,
-            mask: None,
-            alpha: None,
-            clamped: 0,
-        };
+        let frame = Frame::new(
+            "random",
+            SIDE,
+            SIDE,
+            uniform(0.0, 1.0, 3 * SIDE * SIDE, &mut rng),
+            raw.collect(),
+        );
         let folder = TempDir::new().expect("a temporary directory");
         let file = |name: &str| folder.path().join(name);
         let [exported, color, features, weights, output] =

@@ -2,17 +2,16 @@
 
 use std::fmt::Write;
 use std::path::Path;
-use std::process::ExitCode;
 
+use crate::doctor::{Affected, Problem, Report, examine};
+use crate::message::{self, printable};
 use anyhow::Result;
-use demc_data::doctor::{Affected, Problem, Report, examine};
-use demc_data::message::{self, printable};
 
 /// Scenes that are named for a problem; the others are counted.
 const NAMED: usize = 4;
 
 /// Prints one line per problem and a summary, or one JSON object.
-pub fn run(root: &Path, layout: Option<&str>, patch_size: usize, json: bool) -> Result<ExitCode> {
+pub fn run(root: &Path, layout: Option<&str>, patch_size: usize, json: bool) -> Result<u8> {
     if root.is_dir() && !root.join("manifest.json").exists() {
         anyhow::bail!(
             "{} has no manifest.json; run `demc-data index {0}` to write it",
@@ -25,8 +24,8 @@ pub fn run(root: &Path, layout: Option<&str>, patch_size: usize, json: bool) -> 
         false => lines(&report),
     })?;
     Ok(match report.problems.is_empty() {
-        true => ExitCode::SUCCESS,
-        false => ExitCode::FAILURE,
+        true => 0,
+        false => 1,
     })
 }
 

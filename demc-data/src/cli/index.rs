@@ -7,14 +7,14 @@ use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use crate::dataset::{FORMAT, MAX_MANIFEST};
+use crate::exr::ExrFile;
+use crate::frame::{Presence, check_open_header};
+use crate::layout::{MissingPolicies, detect};
+use crate::message::{self, printable};
+use crate::output::{Directories, Outputs};
+use crate::{ChannelLayout, Split, file};
 use anyhow::{Context, Result, bail};
-use demc_data::dataset::{FORMAT, MAX_MANIFEST};
-use demc_data::exr::ExrFile;
-use demc_data::frame::{Presence, check_open_header};
-use demc_data::layout::{MissingPolicies, detect};
-use demc_data::message::{self, printable};
-use demc_data::output::{Directories, Outputs};
-use demc_data::{ChannelLayout, Split, file};
 use serde_json::{Map, Value, json};
 
 use super::IndexArguments;

@@ -2,13 +2,12 @@
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
+use crate::channel::{Channel, ChannelType};
+use crate::exr::ExrFile;
+use crate::message::{self, printable};
+use crate::plane::Plane;
 use anyhow::Result;
-use demc_data::channel::{Channel, ChannelType};
-use demc_data::exr::ExrFile;
-use demc_data::message::{self, printable};
-use demc_data::plane::Plane;
 use serde::Serialize;
 
 #[derive(Serialize)]
@@ -38,15 +37,15 @@ struct FileReport {
 
 /// Prints a table per file, or one JSON array. A file that cannot be read gives one error line and,
 /// at the end, a failure status; the other files are still inspected.
-pub fn run(files: &[PathBuf], json: bool) -> Result<ExitCode> {
+pub fn run(files: &[PathBuf], json: bool) -> Result<u8> {
     let mut reports = Vec::new();
-    let mut status = ExitCode::SUCCESS;
+    let mut status = 0;
     for file in files {
         let channels = match rows(file) {
             Ok(channels) => channels,
             Err(error) => {
                 super::report(&error);
-                status = ExitCode::FAILURE;
+                status = 1;
                 continue;
             }
         };

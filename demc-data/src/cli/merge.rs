@@ -3,11 +3,11 @@
 use std::ffi::OsString;
 use std::path::PathBuf;
 
+use crate::exr::ExrFile;
+use crate::exr::merge::{MergeInput, merge};
+use crate::message::{self, printable};
+use crate::output::{Directories, Outputs};
 use anyhow::Result;
-use demc_data::exr::ExrFile;
-use demc_data::exr::merge::{MergeInput, merge};
-use demc_data::message::{self, printable};
-use demc_data::output::{Directories, Outputs};
 
 use super::{MergeArguments, UsageError};
 

@@ -8,19 +8,19 @@ mod stats;
 
 use std::ffi::OsString;
 use std::path::PathBuf;
-use std::process::ExitCode;
 
+use crate::message::UsageError;
+use crate::output::OutputError;
+use crate::{Split, message};
 use anyhow::Result;
-use clap::{Args, Parser, Subcommand};
-pub use demc_data::message::UsageError;
-use demc_data::{Split, message};
+use clap::{Args, CommandFactory, Parser, Subcommand};
 
 /// Prepares and inspects images and data sets for training a DEMC denoiser.
 ///
 /// Exit status: 0 success, 1 a file or data set cannot be used, 2 wrong arguments.
 #[derive(Parser)]
 #[command(version, max_term_width = 100)]
-pub struct Cli {
+struct Cli {
     #[command(subcommand)]
     command: DataCommand,
 }
@@ -149,31 +149,60 @@ struct IndexArguments {
     overwrite: bool,
 }
 
+/// The command line's description, for manuals and completions.
+pub fn command() -> clap::Command {
+    Cli::command()
+}
+
+/// Runs the program with its name and arguments. Returns the exit code.
+pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
+    let cli = match Cli::try_parse_from(arguments) {
+        Ok(cli) => cli,
+        Err(shown) => return message::usage(&shown),
+    };
+    if let Some(note) = &crate::parallel::threads().note {
+        message::say(format_args!("note: {note}"));
+    }
+    match cli.run() {
+        Ok(status) => status,
+        Err(error) => {
+            report(&error);
+            let refused = error.downcast_ref().is_some_and(OutputError::is_usage);
+            if error.is::<UsageError>() || refused {
+                2
+            } else {
+                1
+            }
+        }
+    }
+}
+
 impl Cli {
     /// Runs the command and returns its exit status; `inspect` has already reported the files that
     /// it could not read.
     ///
     /// # Errors
     /// An error that ended the command and is not yet reported.
-    pub fn run(self) -> Result<ExitCode> {
+    fn run(self) -> Result<u8> {
         match self.command {
             DataCommand::Inspect(args) => inspect::run(&args.files, args.json),
-            DataCommand::Stats(args) => stats::run(&args.root, &args.layout, args.split, args.json)
-                .map(|()| ExitCode::SUCCESS),
+            DataCommand::Stats(args) => {
+                stats::run(&args.root, &args.layout, args.split, args.json).map(|()| 0)
+            }
             DataCommand::Doctor(args) => doctor::run(
                 &args.root,
                 args.layout.as_deref(),
                 args.patch_size,
                 args.json,
             ),
-            DataCommand::Index(args) => index::run(&args).map(|()| ExitCode::SUCCESS),
-            DataCommand::Merge(args) => merge::run(&args).map(|()| ExitCode::SUCCESS),
+            DataCommand::Index(args) => index::run(&args).map(|()| 0),
+            DataCommand::Merge(args) => merge::run(&args).map(|()| 0),
         }
     }
 }
 
 /// Prints an error as one line on standard error.
-pub fn report(error: &anyhow::Error) {
+fn report(error: &anyhow::Error) {
     message::say(format_args!("error: {error:#}"));
 }
 

@@ -4,11 +4,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 use std::path::Path;
 
+use crate::frame::FEATURE_NAMES;
+use crate::message::{self, printable};
+use crate::patch::patches;
+use crate::{ChannelLayout, DataConfig, Dataset, Scene, Split, Statistics};
 use anyhow::Result;
-use demc_data::frame::FEATURE_NAMES;
-use demc_data::message::{self, printable};
-use demc_data::patch::patches;
-use demc_data::{ChannelLayout, DataConfig, Dataset, Scene, Split, Statistics};
 use serde::Serialize;
 
 /// Epsilon of Eq. 5 (Sec. 4.2).

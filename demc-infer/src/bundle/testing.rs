@@ -90,15 +90,5 @@ pub(crate) fn frame(width: usize, height: usize) -> Frame {
         let values = 0..channels * width * height;
         values.map(|i| (i * 7919 % 1013) as f32 / 1013.0).collect()
     };
-    Frame {
-        name: "pattern".into(),
-        width,
-        height,
-        color: pattern(3),
-        features: pattern(FEATURES),
-        reference: None,
-        mask: None,
-        alpha: None,
-        clamped: 0,
-    }
+    Frame::new("pattern", width, height, pattern(3), pattern(FEATURES))
 }

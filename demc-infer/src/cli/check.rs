@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::Bundle;
 use clap::Args;
 use demc_data::exr::ExrFile;
 use demc_data::frame::{FEATURE_NAMES, TEXTURES, decode_input};
@@ -10,7 +11,6 @@ use demc_data::noise::{CORRELATED, correlation};
 use demc_data::ranges::Range;
 use demc_data::transform::MAX_ALBEDO;
 use demc_data::{Frame, FrameSummary};
-use demc_infer::Bundle;
 use serde::Serialize;
 
 use super::flags::{DeviceFlag, ModelFlag};

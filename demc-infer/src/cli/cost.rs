@@ -2,11 +2,11 @@
 
 use std::path::PathBuf;
 
+use crate::{Bundle, Ensemble, Tiling, memory};
 use clap::Args;
 use demc_data::exr::{ExrFile, check_size};
 use demc_data::frame::{Presence, check_open_header};
 use demc_data::message;
-use demc_infer::{Bundle, Ensemble, Tiling, memory};
 use demc_model::{DOWNSAMPLING, ModelConfig};
 use serde::Serialize;
 

@@ -1,16 +1,17 @@
 //! `demc-infer denoise`: denoises EXR files one after another.
 
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
+use crate::denoise::{DenoiseOptions, DenoiseProgress, SeamError};
+use crate::guard::{EnergyBias, Warning};
+use crate::{Bundle, Picture, memory};
 use clap::{Args, ValueEnum};
 use demc_data::exr::rewrite::{OutputChannels, WriteOptions, rewrite_with_layers};
 use demc_data::exr::{Compression, ExrFile};
 use demc_data::frame::{decode_input, decode_repaired};
 use demc_data::output::{Directories, Outputs};
 use demc_data::{ChannelLayout, message};
-use demc_infer::denoise::{DenoiseOptions, SeamError};
-use demc_infer::guard::{EnergyBias, Warning};
-use demc_infer::{Bundle, Picture, memory};
 
 use super::Clamped;
 use super::exposure::{InputScaleFlag, SequenceScales, stops};
@@ -235,12 +236,15 @@ impl Arguments {
             restore_light: self.light.restore_light,
             layers,
         };
-        let on_tile = |done, count| {
-            if count > 1 {
-                progress.start(format_args!("{name}, tile {} of {count}", done + 1));
+        let mut shown = None;
+        let on_progress = |done: DenoiseProgress| {
+            let tile = done.tile + 1;
+            if done.tiles > 1 && shown.replace(tile) != Some(tile) {
+                progress.start(format_args!("{name}, tile {tile} of {}", done.tiles));
             }
+            ControlFlow::Continue(())
         };
-        let denoised = bundle.denoise_with(&frame, &options, on_tile)?;
+        let denoised = bundle.denoise_with(&frame, &options, on_progress)?;
         if denoised.tiles.count() > 1 {
             let plan = describe(&denoised.tiles, &tiling);
             progress.line(format_args!("note: {name}: {plan}"));

@@ -2,10 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::Report;
+use crate::evaluate::Difference;
 use clap::Args;
 use demc_data::message;
-use demc_infer::Report;
-use demc_infer::evaluate::Difference;
 use demc_model::metrics::{self, METRICS, Metric};
 use serde::Serialize;
 

@@ -3,14 +3,14 @@
 use std::env;
 use std::path::{Path, PathBuf};
 
+use crate::bundle::locate;
+use crate::verify::{Runtime, TOLERANCE, verify};
+use crate::{Bundle, BundleFile, Names, Precision};
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
 use demc_data::ChannelLayout;
 use demc_data::message::{self, printable};
 use demc_data::output::Outputs;
-use demc_infer::bundle::locate;
-use demc_infer::verify::{Runtime, TOLERANCE, verify};
-use demc_infer::{Bundle, BundleFile, Names, Precision};
 
 use super::flags::ModelFlag;
 use super::layouts::LAYOUT;

@@ -4,11 +4,11 @@ use std::collections::HashMap;
 use std::path::Path;
 use std::str::FromStr;
 
+use crate::Bundle;
+use crate::denoise::MAX_INPUT_SCALE;
 use clap::Args;
 use demc_data::exr::ExrFile;
 use demc_data::ranges::exposure;
-use demc_infer::Bundle;
-use demc_infer::denoise::MAX_INPUT_SCALE;
 
 use super::inputs::Sequence;
 use super::layouts::Layouts;

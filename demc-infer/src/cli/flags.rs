@@ -2,20 +2,15 @@
 
 use std::path::PathBuf;
 
+use crate::bundle::locate;
+use crate::compute::ComputeFlags;
+use crate::tiles::EXACT_HALO;
+use crate::{Bundle, BundleError, BundleFile, Ensemble, Tiles, Tiling, device};
 use clap::Args;
 use demc_data::exr::MAX_SIDE;
 use demc_data::output::Outputs;
-use demc_infer::bundle::locate;
-use demc_infer::compute::ComputeFlags;
-use demc_infer::tiles::EXACT_HALO;
-use demc_infer::{Bundle, BundleError, BundleFile, Ensemble, Tiles, Tiling, device};
 
 use super::UsageError;
-
-/// The bundled model, described in `models/README.md`.
-const BUNDLED_MODEL: &[u8] = include_bytes!("../../../models/demc.safetensors");
-/// Its name in messages and in `inspect`.
-const BUNDLED_MODEL_NAME: &str = "the bundled model";
 
 /// `--model`.
 #[derive(Args)]
@@ -30,7 +25,7 @@ impl ModelFlag {
     pub fn name(&self) -> String {
         match &self.path {
             Some(path) => path.display().to_string(),
-            None => BUNDLED_MODEL_NAME.into(),
+            None => BundleFile::BUNDLED.into(),
         }
     }
 
@@ -45,7 +40,7 @@ impl ModelFlag {
     pub fn read(&self) -> Result<BundleFile, BundleError> {
         match &self.path {
             Some(path) => BundleFile::read(path),
-            None => BundleFile::parse(BUNDLED_MODEL_NAME.into(), BUNDLED_MODEL),
+            None => BundleFile::bundled(),
         }
     }
 

@@ -2,12 +2,12 @@
 
 use std::path::PathBuf;
 
+use crate::bundle::locate;
+use crate::{BundleError, BundleFile, Names, Precision};
 use burn::tensor::Device;
 use clap::Args;
 use demc_data::message::{self, printable};
 use demc_data::output::Outputs;
-use demc_infer::bundle::locate;
-use demc_infer::{BundleError, BundleFile, Names, Precision};
 
 use super::check_output;
 

@@ -2,13 +2,13 @@
 
 use std::fmt::Write;
 
+use crate::{Bundle, BundleMeta, Names, Precision};
 use burn::tensor::Device;
 use clap::Args;
 use demc_data::ChannelLayout;
 use demc_data::frame::FEATURE_NAMES;
 use demc_data::layout::Missing;
 use demc_data::message::{self, printable};
-use demc_infer::{Bundle, BundleMeta, Names, Precision};
 use serde::Serialize;
 
 use super::flags::ModelFlag;

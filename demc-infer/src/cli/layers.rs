@@ -1,12 +1,12 @@
 //! `--layers`: further channels of a file that are denoised beside its colour.
 
+use crate::denoise::Layer;
+use crate::{Bundle, Ensemble};
 use clap::Args;
 use demc_data::exr::ExrFile;
 use demc_data::frame::layers::{check_layers, decode_layers};
 use demc_data::message::list;
 use demc_data::{ChannelLayout, Error};
-use demc_infer::denoise::Layer;
-use demc_infer::{Bundle, Ensemble};
 use glob::Pattern;
 
 use super::UsageError;

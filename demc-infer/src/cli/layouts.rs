@@ -3,12 +3,12 @@
 use std::cell::RefCell;
 use std::path::Path;
 
+use crate::Bundle;
 use clap::Args;
 use demc_data::exr::ExrFile;
 use demc_data::layout::{FileLayout, Missing, detect};
 use demc_data::output::Outputs;
 use demc_data::{ChannelLayout, Dataset, Error, message};
-use demc_infer::Bundle;
 
 use super::UsageError;
 

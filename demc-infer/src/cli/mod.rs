@@ -23,12 +23,15 @@ mod scenes;
 mod shard;
 mod warnings;
 
+use std::ffi::OsString;
 use std::path::Path;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use demc_data::message;
-pub use demc_data::message::UsageError;
+use demc_data::message::UsageError;
 use demc_data::output::{Directories, OutputError, Outputs};
+
+use crate::compute;
 
 /// Use a trained DEMC network: denoise and score renderings, export and import weights.
 #[derive(Parser)]
@@ -38,7 +41,7 @@ use demc_data::output::{Directories, OutputError, Outputs};
     or a file written by `export`. The default is the bundled model.\n\n\
     Exit codes: 0 success, 1 failure, 2 invalid command line."
 )]
-pub struct Arguments {
+struct Arguments {
     #[command(subcommand)]
     verb: Verb,
 }
@@ -55,8 +58,36 @@ enum Verb {
     Report(report::Arguments),
 }
 
-/// Runs the command.
-pub fn run(arguments: Arguments) -> anyhow::Result<()> {
+/// The command line's description, for manuals and completions.
+pub fn command() -> clap::Command {
+    Arguments::command()
+}
+
+/// Runs the program with its name and arguments. Returns the exit code.
+pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
+    let arguments = match Arguments::try_parse_from(arguments) {
+        Ok(arguments) => arguments,
+        Err(shown) => return message::usage(&shown),
+    };
+    if let Some(note) = &demc_data::parallel::threads().note {
+        message::say(format_args!("note: {note}"));
+    }
+    let done = compute::on_threads(|| run(arguments));
+    match done.map_err(anyhow::Error::from).flatten() {
+        Ok(()) => 0,
+        Err(error) => {
+            message::say(format_args!("error: {error:#}"));
+            let refused = error.downcast_ref().is_some_and(OutputError::is_usage);
+            if error.is::<UsageError>() || refused {
+                2
+            } else {
+                1
+            }
+        }
+    }
+}
+
+fn run(arguments: Arguments) -> anyhow::Result<()> {
     match arguments.verb {
         Verb::Denoise(command) => command.run(),
         Verb::Cost(command) => command.run(),

@@ -3,9 +3,9 @@
 use std::io::Write;
 use std::path::PathBuf;
 
+use crate::report::{About, ReportPage};
 use clap::Args;
 use demc_data::message::{self, printable};
-use demc_infer::report::{About, ReportPage};
 
 use super::scenes::{Scenes, require_all};
 

@@ -2,14 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::denoise::{DenoiseError, DenoiseOptions, Denoised, unobserved};
+use crate::evaluate::FailedImage;
+use crate::report::SceneImages;
+use crate::{Baseline, BaselineError, Ensemble, ImageScore, Report, baseline};
 use clap::{Args, ValueEnum};
 use demc_data::message::printable;
 use demc_data::output::Outputs;
 use demc_data::{ChannelLayout, Dataset, Frame, Rgb, Scene};
-use demc_infer::denoise::{DenoiseError, DenoiseOptions, Denoised};
-use demc_infer::evaluate::FailedImage;
-use demc_infer::report::SceneImages;
-use demc_infer::{Baseline, BaselineError, Ensemble, ImageScore, Report, baseline};
 
 use super::exposure::InputScaleFlag;
 use super::flags::{DeviceFlag, EnsembleFlag, LightFlag, ModelFlag};
@@ -130,7 +130,7 @@ impl Scenes {
         };
         for scene in &scenes {
             progress.start(&scene.name);
-            let denoise = |frame: &Frame| bundle.denoise_with(frame, &options, |_, _| ());
+            let denoise = |frame: &Frame| bundle.denoise_with(frame, &options, unobserved);
             let process = |images: &SceneImages| process(images, scenes.len());
             match self.score_scene(scene, layout, denoise, process, &mut clamped) {
                 Ok((score, processed)) => {

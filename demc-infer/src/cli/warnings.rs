@@ -3,7 +3,7 @@
 use std::cell::RefCell;
 use std::path::Path;
 
-use demc_infer::guard::Warning;
+use crate::guard::Warning;
 
 /// Largest number of images in a list.
 const MAX_NAMES: usize = 20;

@@ -11,7 +11,7 @@ use demc_data::transform::MAX_ALBEDO;
 use demc_model::config::COLOR_CHANNELS;
 use rayon::prelude::*;
 
-use super::{DenoiseError, FrameInput};
+use super::{DenoiseError, DenoiseObserver, DenoiseProgress, FrameInput};
 use crate::ensemble::Ensemble;
 use crate::tiles::Tiling;
 
@@ -22,7 +22,11 @@ impl FrameInput<'_> {
     /// # Errors
     /// The filter's smallest tile does not fit into memory, the device fails, or its output is not
     /// finite.
-    pub(super) fn filter_albedo(&mut self, tiling: &Tiling) -> Result<(), DenoiseError> {
+    pub(super) fn filter_albedo(
+        &mut self,
+        tiling: &Tiling,
+        observer: &mut DenoiseObserver,
+    ) -> Result<(), DenoiseError> {
         let frame = self.frame;
         let pixels = frame.width * frame.height;
         let albedo = &frame.features[TEXTURES * pixels..][..COLOR_CHANNELS * pixels];
@@ -46,7 +50,10 @@ impl FrameInput<'_> {
             name: frame.name.clone(),
             source,
         })?;
-        let mut filtered = own.denoise_into(self.padded(), &tiles, |_, _| ())?;
+        let mut filtered = own.denoise_into(self.padded(), &tiles, &mut |progress| {
+            let share = 0.0;
+            observer(DenoiseProgress { share, ..progress })
+        })?;
         let padded = self.padded();
         let rows = filtered.par_chunks_mut(padded.width).enumerate();
         rows.for_each(|(row, filtered)| {

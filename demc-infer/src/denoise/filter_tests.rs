@@ -25,14 +25,13 @@ fn filtered_by_hand(bundle: &Bundle, original: &Frame) -> Frame {
         height: original.height,
         width: original.width,
     };
-    let mut padded = Frame {
-        height: padding.padded_height(),
-        width: padding.padded_width(),
-        color: padding.pad(&original.color),
-        features: padding.pad(&original.features),
-        alpha: None,
-        ..original.clone()
-    };
+    let mut padded = Frame::new(
+        original.name.clone(),
+        padding.padded_width(),
+        padding.padded_height(),
+        padding.pad(&original.color),
+        padding.pad(&original.features),
+    );
     let mut noisy = padded.clone();
     noisy.color = albedo(&mut padded)
         .iter()

@@ -7,10 +7,11 @@ use demc_data::frame::TEXTURES;
 use demc_data::transform::exposure_scale;
 use demc_data::{FEATURES, Frame, PositionMap};
 use demc_model::config::COLOR_CHANNELS;
+use demc_model::inference::Cancelled;
 use rayon::prelude::*;
 
-use super::DenoiseError;
 use super::layers::{Layer, LayerTile};
+use super::{DenoiseError, DenoiseObserver, DenoiseProgress};
 use crate::Bundle;
 use crate::ensemble::Ensemble;
 use crate::error::check_sizes;
@@ -94,9 +95,9 @@ impl<'a> FrameInput<'a> {
     pub(super) fn denoise(
         &self,
         tiles: &Tiles,
-        progress: impl FnMut(usize, usize),
+        observer: &mut DenoiseObserver,
     ) -> Result<Vec<f32>, DenoiseError> {
-        self.denoise_into(self.padding, tiles, progress)
+        self.denoise_into(self.padding, tiles, observer)
     }
 
     /// As [`denoise`](Self::denoise), but the output has the size of `size`: that of the image, or
@@ -105,13 +106,18 @@ impl<'a> FrameInput<'a> {
         &self,
         size: Padding,
         tiles: &Tiles,
-        mut progress: impl FnMut(usize, usize),
+        observer: &mut DenoiseObserver,
     ) -> Result<Vec<f32>, DenoiseError> {
         let mut out = Vec::new();
         let mut bad = 0;
         for (done, (rows, columns)) in tiles.iter().enumerate() {
-            progress(done, tiles.count());
-            let tile = self.tile(&rows.read, &columns.read)?;
+            let count = tiles.count();
+            let place = |share| DenoiseProgress {
+                tile: done,
+                tiles: count,
+                share: (done as f64 + share) / count as f64,
+            };
+            let tile = self.tile([&rows.read, &columns.read], observer, place)?;
             bad += tile.par_iter().filter(|x| !x.is_finite()).count();
             if (&rows.read, &columns.read) == (&(0..size.height), &(0..size.width)) {
                 out = tile;
@@ -135,7 +141,11 @@ impl<'a> FrameInput<'a> {
     ///
     /// # Shapes
     /// Returns `[H, W]`, from 0 to 1.
-    pub(super) fn denoise_alpha(&self, tiles: &Tiles) -> Result<Option<Vec<f32>>, DenoiseError> {
+    pub(super) fn denoise_alpha(
+        &self,
+        tiles: &Tiles,
+        observer: &mut DenoiseObserver,
+    ) -> Result<Option<Vec<f32>>, DenoiseError> {
         let Some(alpha) = &self.frame.alpha else {
             return Ok(None);
         };
@@ -150,7 +160,10 @@ impl<'a> FrameInput<'a> {
             demodulate: false,
             ..self.clone()
         };
-        let image = input.denoise(tiles, |_, _| ())?;
+        let image = input.denoise(tiles, &mut |progress| {
+            let share = 1.0;
+            observer(DenoiseProgress { share, ..progress })
+        })?;
         let pixels = alpha.len();
         let denoised = alpha
             .iter()
@@ -166,15 +179,23 @@ impl<'a> FrameInput<'a> {
         Ok(Some(denoised.collect()))
     }
 
-    /// Denoises one tile. NaN in the network's output stays NaN.
+    /// Denoises one tile. NaN in the network's output stays NaN. `place` makes the image's progress of
+    /// the tile's.
     ///
     /// # Shapes
     /// Returns `[3 + layers, rows, columns]` in linear HDR.
     pub(super) fn tile(
         &self,
-        rows: &PixelRange,
-        columns: &PixelRange,
+        [rows, columns]: [&PixelRange; 2],
+        observer: &mut DenoiseObserver,
+        place: impl Fn(f64) -> DenoiseProgress,
     ) -> Result<Vec<f32>, DenoiseError> {
+        let cancelled = |_| DenoiseError::Cancelled {
+            name: self.frame.name.clone(),
+        };
+        if observer(place(0.0)).is_break() {
+            return Err(cancelled(Cancelled));
+        }
         let normalizer = &self.bundle.meta.normalizer;
         let mut color = self.padding.cut(self.color, rows.clone(), columns.clone());
         let (modulation, features_z) = self.modulation_and_features(rows, columns);
@@ -190,17 +211,21 @@ impl<'a> FrameInput<'a> {
             normalizer.gamma,
             [rows, columns],
         );
+        let (mut pass, passes) = (0, self.ensemble.count() as f64);
+        let mut forward = |[color, features]: [Tensor<4>; 2], layers: Option<Tensor<4>>| {
+            let share = |share: f64| (f64::from(pass) + share) / passes;
+            let mut observe = |done| observer(place(share(done)));
+            let out = network.forward_observed(color, features, layers, &mut observe);
+            pass += 1;
+            out.map_err(cancelled)
+        };
+        let inputs = [color_gamma, features_z];
         let (out, filtered) = match self.layers.is_empty() {
             true => {
-                let inputs = [color_gamma, features_z];
-                let forward = |[color, features]: [Tensor<4>; 2]| network.forward(color, features);
-                (self.ensemble.mean(inputs, forward), None)
+                let forward = |inputs| forward(inputs, None).map(|(out, _)| out);
+                (self.ensemble.mean(inputs, forward)?, None)
             }
-            false => {
-                let input = layers.input(self.padding, &self.device);
-                let (out, filtered) = network.forward_with_layers(color_gamma, features_z, input);
-                (out, Some(filtered))
-            }
+            false => forward(inputs, Some(layers.input(self.padding, &self.device)))?,
         };
         let mut out = self.read(out)?;
         in_pieces(&mut out, modulation.as_deref(), |out, modulation| {

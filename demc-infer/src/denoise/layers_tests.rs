@@ -52,7 +52,7 @@ fn run(bundle: &Bundle, frame: &Frame, layers: &[Layer], tiling: Tiling) -> Deno
         layers: layers.to_vec(),
         ..DenoiseOptions::default()
     };
-    let denoised = bundle.denoise_with(frame, &options, |_, _| ());
+    let denoised = bundle.denoise_with(frame, &options, unobserved);
     denoised.expect("denoised")
 }
 
@@ -173,7 +173,7 @@ fn layers_that_cannot_be_filtered_are_refused() {
             }],
             ..DenoiseOptions::default()
         };
-        match bundle.denoise_with(&frame, &options, |_, _| ()) {
+        match bundle.denoise_with(&frame, &options, unobserved) {
             Err(DenoiseError::Layers { source, .. }) => source,
             other => panic!("{other:?}"),
         }

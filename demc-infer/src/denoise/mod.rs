@@ -9,9 +9,12 @@ mod layers;
 #[cfg(test)]
 mod layers_tests;
 mod light;
+mod progress;
 mod seams;
 #[cfg(test)]
 mod tests;
+
+use std::ops::ControlFlow;
 
 use burn::module::Module;
 use burn::tensor::Device;
@@ -30,6 +33,7 @@ use layers::{check_layer_sizes, layer_images};
 pub use crate::error::{DenoiseError, LayersError};
 pub use demc_data::transform::MAX_INPUT_SCALE;
 pub use layers::Layer;
+pub use progress::{DenoiseObserver, DenoiseProgress, unobserved};
 pub use seams::SeamError;
 
 /// Exposures up to this factor outside the training scenes' range are not scaled: a stop, the
@@ -84,21 +88,21 @@ impl Bundle {
     /// As [`check_statistics`](Self::check_statistics). Further: the smallest tile does not fit
     /// into the available memory, the device fails, or the output is not finite.
     pub fn denoise(&self, frame: &Frame) -> Result<Vec<f32>, DenoiseError> {
-        self.denoise_with(frame, &DenoiseOptions::default(), |_, _| ())
+        self.denoise_with(frame, &DenoiseOptions::default(), unobserved)
             .map(|denoised| denoised.color_hdr)
     }
 
     /// As [`denoise`](Self::denoise), with options.
     ///
-    /// `progress` is called before each tile with the number of finished tiles and of all tiles.
+    /// `observer` receives the progress, and may stop the work.
     ///
     /// # Errors
-    /// As [`denoise`](Self::denoise).
+    /// As [`denoise`](Self::denoise), and [`DenoiseError::Cancelled`].
     pub fn denoise_with(
         &self,
         frame: &Frame,
         options: &DenoiseOptions,
-        progress: impl FnMut(usize, usize),
+        mut observer: impl FnMut(DenoiseProgress) -> ControlFlow<()>,
     ) -> Result<Denoised, DenoiseError> {
         let DenoiseOptions {
             tiling,
@@ -124,7 +128,8 @@ impl Bundle {
             None => self.input_scale(demc_data::ranges::exposure(&frame.color)),
         };
         self.check_statistics(frame)?;
-        input.filter_albedo(tiling)?;
+        let observer: &mut DenoiseObserver = &mut observer;
+        input.filter_albedo(tiling, observer)?;
         let size = Padding {
             height: frame.height,
             width: frame.width,
@@ -136,13 +141,13 @@ impl Bundle {
                 source,
             })?;
         input.layers = layers;
-        let mut color_hdr = input.denoise(&tiles, progress)?;
+        let mut color_hdr = input.denoise(&tiles, observer)?;
         let mut layer_planes = color_hdr.split_off(COLOR_CHANNELS * pixels);
         input.layers = &[];
-        let alpha = input.denoise_alpha(&tiles)?;
+        let alpha = input.denoise_alpha(&tiles, observer)?;
         let seam_error = match tiling.is_exact() {
             true => None,
-            false => input.seam_error(&tiles, &color_hdr)?,
+            false => input.seam_error(&tiles, &color_hdr, observer)?,
         };
         if restore_light.unwrap_or(self.meta.normalizer.restore_light) {
             let factors = light::factors(&frame.color, &color_hdr, frame.height, frame.width);
@@ -198,10 +203,10 @@ impl Bundle {
             positions: None,
             ..FrameInput::new(self, frame)?
         };
-        input.filter_albedo(&Tiling::default())?;
+        input.filter_albedo(&Tiling::default(), &mut unobserved)?;
         let padded = (input.padding.padded_height(), input.padding.padded_width());
         let tiles = Tiles::plan(padded, &Tiling::default(), |_, _| 0, None);
-        input.denoise(&tiles.expect("no limit on memory"), |_, _| ())
+        input.denoise(&tiles.expect("no limit on memory"), &mut unobserved)
     }
 
     /// The tiles that [`denoise_with`](Self::denoise_with) would cut an image of `height` x
@@ -275,7 +280,7 @@ impl Bundle {
     /// As [`denoise`](Self::denoise).
     pub fn detail_map(&self, frame: &Frame) -> Result<Option<Vec<f32>>, DenoiseError> {
         let mut input = FrameInput::new(self, frame)?;
-        input.filter_albedo(&Tiling::default())?;
+        input.filter_albedo(&Tiling::default(), &mut unobserved)?;
         let (height, width) = (input.padding.padded_height(), input.padding.padded_width());
         let map = self.model.detail_map(input.features_z(0..height, 0..width));
         let map = map.map(|map| input.read(map)).transpose()?;

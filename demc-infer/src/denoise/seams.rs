@@ -6,7 +6,7 @@ use crate::tiles::{EXACT_HALO, Span, Tiles};
 use demc_model::DOWNSAMPLING;
 use demc_model::metrics::rel_mse_image;
 
-use super::{DenoiseError, FrameInput, PixelRange};
+use super::{DenoiseError, DenoiseObserver, DenoiseProgress, FrameInput, PixelRange};
 
 /// Side of a window in pixels, a multiple of 32.
 const WINDOW: usize = 64;
@@ -31,6 +31,7 @@ impl FrameInput<'_> {
         &self,
         tiles: &Tiles,
         color_hdr: &[f32],
+        observer: &mut DenoiseObserver,
     ) -> Result<Option<SeamError>, DenoiseError> {
         let windows = windows(tiles, self.padding);
         let mut error = SeamError {
@@ -39,7 +40,7 @@ impl FrameInput<'_> {
             windows: windows.len(),
         };
         for (rows, columns) in &windows {
-            let tile = self.tile(&rows.read, &columns.read)?;
+            let tile = self.tile([&rows.read, &columns.read], observer, at_end(tiles))?;
             let image = |range: &Span, side: usize| range.core.start..range.core.end.min(side);
             let (y, x) = (
                 image(rows, self.padding.height),
@@ -61,6 +62,16 @@ impl FrameInput<'_> {
             error.largest = error.largest.max(f64::from(difference / scale));
         }
         Ok((!windows.is_empty()).then_some(error))
+    }
+}
+
+/// The progress of an image whose tiles are all computed.
+fn at_end(tiles: &Tiles) -> impl Fn(f64) -> DenoiseProgress {
+    let tiles = tiles.count();
+    move |_| DenoiseProgress {
+        tile: tiles - 1,
+        tiles,
+        share: 1.0,
     }
 }
 

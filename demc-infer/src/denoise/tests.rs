@@ -1,5 +1,7 @@
 //! Tests with a narrow network on frames with a pattern.
 
+use std::ops::ControlFlow;
+
 use demc_data::Frame;
 use demc_model::Variant;
 
@@ -28,7 +30,7 @@ pub(super) fn denoise(
         input_scale: Some(1.0),
         ..DenoiseOptions::default()
     };
-    bundle.denoise_with(frame, &options, |_, _| ())
+    bundle.denoise_with(frame, &options, unobserved)
 }
 
 #[test]
@@ -49,13 +51,8 @@ fn padding_equals_an_image_padded_by_hand() {
         height: 33,
         width: 31,
     };
-    let large = Frame {
-        width: 32,
-        height: 64,
-        color: padding.pad(&small.color),
-        features: padding.pad(&small.features),
-        ..small.clone()
-    };
+    let [color, features] = [&small.color, &small.features].map(|planes| padding.pad(planes));
+    let large = Frame::new("large", 32, 64, color, features);
     let expected = padding.crop(&bundle.denoise(&large).expect("large"));
     assert_eq!(bundle.denoise(&small).expect("small"), expected);
 }
@@ -72,10 +69,8 @@ fn demodulation_equals_a_division_by_hand() {
     let textures = &frame.features[texture * pixels..(texture + 3) * pixels];
     let divisors: Vec<f32> = textures.iter().map(|t| t.max(0.0) + 0.07).collect();
     let pairs = frame.color.iter().zip(&divisors);
-    let divided = Frame {
-        color: pairs.map(|(color, by)| color / by).collect(),
-        ..frame.clone()
-    };
+    let mut divided = frame.clone();
+    divided.color = pairs.map(|(color, by)| color / by).collect();
     let tiled = Tiling {
         side: Some(64),
         ..Tiling::default()
@@ -205,9 +200,47 @@ fn every_tile_is_announced() {
         tiling,
         ..DenoiseOptions::default()
     };
-    let denoised = bundle.denoise_with(&frame, &options, |done, of| heard.push((done, of)));
+    let denoised = bundle.denoise_with(&frame, &options, |progress| {
+        heard.push(progress);
+        ControlFlow::Continue(())
+    });
     assert!(denoised.is_ok());
-    assert_eq!(heard, [(0, 4), (1, 4), (2, 4), (3, 4)]);
+    let mut tiles: Vec<usize> = heard.iter().map(|progress| progress.tile).collect();
+    tiles.dedup();
+    assert_eq!(tiles, [0, 1, 2, 3]);
+    assert!(heard.iter().all(|progress| progress.tiles == 4));
+    let shares: Vec<f64> = heard.iter().map(|progress| progress.share).collect();
+    assert!(shares.is_sorted() && shares[0] == 0.0, "{shares:?}");
+    assert!(shares[shares.len() - 1] > 0.99, "{shares:?}");
+}
+
+#[test]
+fn the_observer_can_stop_the_work_at_every_call() {
+    let bundle = bundle(Variant::ColorOnly);
+    let frame = frame(64, 40);
+    let options = DenoiseOptions {
+        ensemble: Ensemble::Four,
+        ..DenoiseOptions::default()
+    };
+    let stop_at = |last: usize| {
+        let mut calls = 0;
+        let done = bundle.denoise_with(&frame, &options, |_| {
+            calls += 1;
+            match calls == last {
+                true => ControlFlow::Break(()),
+                false => ControlFlow::Continue(()),
+            }
+        });
+        (done, calls)
+    };
+    let (done, calls) = stop_at(usize::MAX);
+    assert!(done.is_ok() && calls > 4, "{calls}");
+    for last in 1..=calls {
+        let (done, calls) = stop_at(last);
+        assert_eq!(calls, last);
+        let error = done.expect_err("cancelled").to_string();
+        assert_eq!(error, "pattern: cancelled");
+    }
 }
 
 /// Eight passes give the same image for a transposed input, up to the order of sums; one pass does
@@ -225,13 +258,9 @@ fn an_ensemble_does_not_mind_how_an_image_is_held() {
             .collect()
     };
     let upright = frame(width, height);
-    let lying = Frame {
-        width: height,
-        height: width,
-        color: turned(&upright.color, width, height),
-        features: turned(&upright.features, width, height),
-        ..upright.clone()
-    };
+    let [color, features] =
+        [&upright.color, &upright.features].map(|planes| turned(planes, width, height));
+    let lying = Frame::new("lying", height, width, color, features);
     let changed = |ensemble| {
         let image = |frame: &Frame| {
             let denoised = denoise(&bundle, frame, &Tiling::default(), ensemble);
@@ -283,7 +312,7 @@ fn the_exposure_of_an_unusual_image_does_not_matter() {
         input_scale: Some(4.0),
         ..DenoiseOptions::default()
     };
-    let other = bundle.denoise_with(&frame, &options, |_, _| ());
+    let other = bundle.denoise_with(&frame, &options, unobserved);
     assert!(difference(&other.expect("denoised").color_hdr, &expected) > 1e-3);
 }
 
@@ -297,7 +326,7 @@ fn restored_light_is_that_of_the_noisy_image_and_an_option_wins() {
             restore_light,
             ..DenoiseOptions::default()
         };
-        let denoised = bundle.denoise_with(&frame, &options, |_, _| ());
+        let denoised = bundle.denoise_with(&frame, &options, unobserved);
         denoised.expect("denoised").color_hdr
     };
     let plain = run(&bundle, None);

@@ -269,17 +269,7 @@ fn synthetic_frame(
             mean + std * z
         }));
     }
-    Frame {
-        name: "synthetic".into(),
-        width,
-        height,
-        color,
-        features,
-        reference: None,
-        mask: None,
-        alpha: None,
-        clamped: 0,
-    }
+    Frame::new("synthetic", width, height, color, features)
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use demc_kernels::{Grid, Isa, memory};
 
 use super::band::bands;
 use super::folded::FoldedConv;
-use super::{FeatureMaps, InferencePass};
+use super::{Cancelled, FeatureMaps, InferencePass};
 use crate::decoder::DecoderLevel;
 
 impl InferencePass<'_> {
@@ -18,20 +18,22 @@ impl InferencePass<'_> {
         level: &DecoderLevel,
         below: &FeatureMaps,
         mut sum: FeatureMaps,
-    ) -> FeatureMaps {
+    ) -> Result<FeatureMaps, Cancelled> {
         let convs = folded_level(level);
         let prepared = self.prepare_level(level, &convs);
         let grid = sum.grid;
         if !self.plan.is_banded(grid) {
             prepared.fuse(below.grid, &below.values, 0, &mut sum.values);
-            return sum;
+            self.watch.add(grid.pixels())?;
+            return Ok(sum);
         }
         for image in 0..grid.batch {
             for rows in bands(grid.height, self.plan.band) {
+                self.watch.add(rows.len() * grid.width)?;
                 prepared.fuse_rows(below, image, rows.clone(), sum.rows_mut(image, rows));
             }
         }
-        sum
+        Ok(sum)
     }
 
     /// The level with its prepared weights; `convs` are those of [`folded_level`].

@@ -9,7 +9,7 @@ use demc_kernels::{Grid, pool};
 use super::band::{BandedConv, ConvChain, RowWindow, bands};
 use super::folded::FoldedConv;
 use super::images::InputImages;
-use super::{FeatureMaps, InferencePass};
+use super::{Cancelled, FeatureMaps, InferencePass};
 use crate::config::{Input, LEVELS};
 use crate::encoder::EncoderLevel;
 use crate::fusion::Fusion;
@@ -41,7 +41,11 @@ impl InferencePass<'_> {
 
     /// Computes a level of all encoders on whole maps: `inputs` become those of the level below.
     /// Returns the skips' share of the level's fusion.
-    pub(super) fn encode_level(&self, level: usize, inputs: &mut Vec<FeatureMaps>) -> FeatureMaps {
+    pub(super) fn encode_level(
+        &self,
+        level: usize,
+        inputs: &mut Vec<FeatureMaps>,
+    ) -> Result<FeatureMaps, Cancelled> {
         let grid = inputs[0].grid;
         let fusion = self.skip_fusion(level);
         let mut sum = FeatureMaps::new(grid, fusion.outputs());
@@ -60,7 +64,8 @@ impl InferencePass<'_> {
                 inputs.push(below);
             }
         }
-        sum
+        self.watch.add(grid.pixels())?;
+        Ok(sum)
     }
 
     /// Adds an encoder's share of a fusion to `sum`, which holds the shares of the encoders before
@@ -95,11 +100,12 @@ impl InferencePass<'_> {
         &self,
         level: usize,
         inputs: &mut Vec<FeatureMaps>,
-    ) -> FeatureMaps {
+    ) -> Result<FeatureMaps, Cancelled> {
         let grid = inputs[0].grid;
         let fusion = self.skip_fusion(level);
         let mut sum = FeatureMaps::new(grid, fusion.outputs());
         let mut below = Vec::with_capacity(inputs.len());
+        let encoders = inputs.len();
         for (index, input) in std::mem::take(inputs).into_iter().enumerate() {
             let convs = self.folded_levels(index, level..level + 1);
             let mut levels = self.banded_levels(index, level..level + 1, grid, &convs);
@@ -107,6 +113,7 @@ impl InferencePass<'_> {
             for image in 0..grid.batch {
                 levels.iter_mut().for_each(|level| level.chain.restart());
                 for rows in bands(grid.height, self.plan.band) {
+                    self.watch.add(rows.len() * grid.width / encoders)?;
                     let target = levels[0].chain.input().push(rows.len());
                     target.copy_from_slice(input.rows(image, rows));
                     self.advance(&mut levels, image, pooled.as_mut(), |_, rows, skip| {
@@ -118,7 +125,7 @@ impl InferencePass<'_> {
             below.extend(pooled);
         }
         *inputs = below;
-        sum
+        Ok(sum)
     }
 
     /// Computes all rows of `levels` that the input of the first one allows. The pooled rows of the

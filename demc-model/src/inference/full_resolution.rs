@@ -16,7 +16,7 @@ use super::encoder::{BandedLevel, folded_block};
 use super::folded::FoldedConv;
 use super::images::InputImages;
 use super::kernel_head::KernelHead;
-use super::{FeatureMaps, InferencePass};
+use super::{Cancelled, FeatureMaps, InferencePass};
 use crate::config::{COLOR_CHANNELS, DETAIL_CHANNELS, Input};
 
 /// Number of levels that each band passes in one go. Their prepared weights are in memory together;
@@ -43,7 +43,10 @@ impl InferencePass<'_> {
     }
 
     /// Computes the first [`UPPER_LEVELS`] levels of all encoders from the images.
-    pub(super) fn encode_upper_levels(&self, images: InputImages) -> UpperLevels {
+    pub(super) fn encode_upper_levels(
+        &self,
+        images: InputImages,
+    ) -> Result<UpperLevels, Cancelled> {
         let (grid, inputs) = (images.grid, self.inputs_by_encoder());
         let skip_fusion = self.skip_fusion(UPPER_LEVELS - 1);
         let mut sum = FeatureMaps::new(grid.halved(), skip_fusion.outputs());
@@ -73,6 +76,8 @@ impl InferencePass<'_> {
             let all = levels.iter_mut().flatten();
             all.for_each(|level| level.chain.restart());
             for rows in bands(grid.height, self.plan.band) {
+                // The second level has a quarter of the pixels.
+                self.watch.add(rows.len() * grid.width * 5 / 4)?;
                 let mut rows = rows;
                 if let (Some(fusion), Some(detail)) = (&mut fusion, &mut detail) {
                     let target = fusion.input().push(rows.len());
@@ -103,11 +108,11 @@ impl InferencePass<'_> {
             }
         }
         let images = images.retain(&inputs.concat());
-        UpperLevels {
+        Ok(UpperLevels {
             sum,
             sources: SkipSources { images, detail },
             below: below.into_iter().flatten().collect(),
-        }
+        })
     }
 
     /// The planar output image, and the layers: the decoder's last level and the head. `below` is the
@@ -117,7 +122,7 @@ impl InferencePass<'_> {
         below: &FeatureMaps,
         sources: SkipSources,
         kernel_head: Option<KernelHead>,
-    ) -> (Vec<f32>, Option<Vec<f32>>) {
+    ) -> Result<(Vec<f32>, Option<Vec<f32>>), Cancelled> {
         let SkipSources { images, detail } = sources;
         let (grid, inputs) = (images.grid, self.inputs_by_encoder());
         let decoder = &self.model.decoder;
@@ -154,6 +159,7 @@ impl InferencePass<'_> {
             skips.iter_mut().for_each(ConvChain::restart);
             output.restart();
             for rows in bands(grid.height, self.plan.band) {
+                self.watch.add(rows.len() * grid.width)?;
                 let detail = detail
                     .as_ref()
                     .map(|detail| detail.rows(image, rows.clone()));
@@ -182,7 +188,7 @@ impl InferencePass<'_> {
                 output.advance(grid, image);
             }
         }
-        output.finish()
+        Ok(output.finish())
     }
 }
 

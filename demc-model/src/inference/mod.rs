@@ -24,6 +24,7 @@ mod images;
 mod kernel_head;
 #[cfg(test)]
 mod tests;
+mod watch;
 
 use std::ops::Range;
 
@@ -42,9 +43,11 @@ use encoder::{DEEPEST_BANDED, folded_block};
 use full_resolution::{SkipSources, UPPER_LEVELS};
 use images::InputImages;
 use kernel_head::KernelHead;
+use watch::Watch;
 
 pub use estimate::{pass_bytes, peak_bytes, reusable_bytes};
 pub use folded::{FoldedConv, norm_scale};
+pub use watch::{Cancelled, Observer};
 
 /// Pixels of the full resolution in a band, per thread: enough work for a thread, little enough for
 /// caches.
@@ -61,34 +64,43 @@ pub(crate) fn forward(
     color_gamma: Tensor<4>,
     features_z: Tensor<4>,
     layers: Option<Tensor<4>>,
-) -> (Tensor<4>, Option<Tensor<4>>) {
+    observer: &mut Observer,
+) -> Result<(Tensor<4>, Option<Tensor<4>>), Cancelled> {
     let plan = BandPlan::new(color_gamma.dims()[3]);
-    forward_with(model, color_gamma, features_z, layers, Tile::F4, plan)
+    forward_with(
+        model,
+        [color_gamma, features_z],
+        layers,
+        Tile::F4,
+        plan,
+        observer,
+    )
 }
 
 /// The same with a given size of tiles and plan.
 fn forward_with(
     model: &Denoiser,
-    color_gamma: Tensor<4>,
-    features_z: Tensor<4>,
+    [color_gamma, features_z]: [Tensor<4>; 2],
     layers: Option<Tensor<4>>,
     tile: Tile,
     plan: BandPlan,
-) -> (Tensor<4>, Option<Tensor<4>>) {
+    observer: &mut Observer,
+) -> Result<(Tensor<4>, Option<Tensor<4>>), Cancelled> {
     let [batch, _, height, width] = color_gamma.dims();
+    let takes_features = model.config().variant.spec().takes_features();
+    let images = InputImages::new(color_gamma, takes_features.then_some(features_z));
+    let grid = images.grid;
     let pass = InferencePass {
         isa: Isa::current(),
         tile,
         plan,
         model,
+        watch: &Watch::new(grid, observer),
     };
-    let takes_features = model.config().variant.spec().takes_features();
-    let images = InputImages::new(color_gamma, takes_features.then_some(features_z));
-    let grid = images.grid;
     let color = model.decoder.head.is_none().then(|| images.color());
-    let encoded = pass.encode(images);
+    let encoded = pass.encode(images)?;
     let head = color.map(|color| KernelHead::new(pass.isa, model, grid, &color, layers));
-    let (out, layers) = pass.decode(encoded, head);
+    let (out, layers) = pass.decode(encoded, head)?;
     let tensor = |planes: Vec<f32>, images: usize| {
         let shape = [images, COLOR_CHANNELS, height, width];
         Tensor::from_primitive::<Flex>(FlexTensor::from_data(TensorData::new(planes, shape)))
@@ -98,7 +110,7 @@ fn forward_with(
         let images = layers.len() / image;
         tensor(layers, images)
     });
-    (tensor(out, batch), layers)
+    Ok((tensor(out, batch), layers))
 }
 
 #[derive(Clone, Copy)]
@@ -131,6 +143,7 @@ struct InferencePass<'a> {
     tile: Tile,
     plan: BandPlan,
     model: &'a Denoiser,
+    watch: &'a Watch<'a, 'a>,
 }
 
 struct EncodedImages {
@@ -144,11 +157,11 @@ struct EncodedImages {
 }
 
 impl InferencePass<'_> {
-    fn encode(&self, images: InputImages) -> EncodedImages {
+    fn encode(&self, images: InputImages) -> Result<EncodedImages, Cancelled> {
         let (mut sums, mut sources) = (Vec::with_capacity(LEVELS), None);
         let (first, mut inputs) = match self.plan.is_banded(images.grid) {
             true => {
-                let upper = self.encode_upper_levels(images);
+                let upper = self.encode_upper_levels(images)?;
                 sums.push(upper.sum);
                 sources = Some(upper.sources);
                 (UPPER_LEVELS, upper.below)
@@ -159,16 +172,16 @@ impl InferencePass<'_> {
             let grid = inputs[0].grid;
             let banded = level <= DEEPEST_BANDED && self.plan.is_banded(grid);
             sums.push(match banded {
-                true => self.encode_level_in_bands(level, &mut inputs),
-                false => self.encode_level(level, &mut inputs),
+                true => self.encode_level_in_bands(level, &mut inputs)?,
+                false => self.encode_level(level, &mut inputs)?,
             });
         }
         let bottom = inputs.pop().expect("the last encoder feeds the latent");
-        EncodedImages {
+        Ok(EncodedImages {
             sums,
             sources,
             bottom,
-        }
+        })
     }
 
     /// The planes of the denoised images, and of the layers of a kernel head.
@@ -176,7 +189,7 @@ impl InferencePass<'_> {
         &self,
         encoded: EncodedImages,
         mut head: Option<KernelHead>,
-    ) -> (Vec<f32>, Option<Vec<f32>>) {
+    ) -> Result<(Vec<f32>, Option<Vec<f32>>), Cancelled> {
         let EncodedImages {
             sums,
             sources,
@@ -187,19 +200,19 @@ impl InferencePass<'_> {
         let decoder = &self.model.decoder;
         let levels = decoder.levels.iter().zip(sums.into_iter().rev());
         for (index, (level, sum)) in levels.enumerate() {
-            x = self.decode_level(level, &x, sum);
+            x = self.decode_level(level, &x, sum)?;
             if let Some(head) = &mut head {
                 self.filter_level(head, LEVELS - 1 - index, &x);
             }
         }
         match (sources, head) {
             (Some(sources), head) => self.decode_full_resolution(&x, sources, head),
-            (None, Some(head)) => head.finish(),
+            (None, Some(head)) => Ok(head.finish()),
             (None, None) => {
                 let image = self.conv3x3(&x, &FoldedConv::conv(conv_head(decoder), None));
                 let mut planar = memory::buffer(image.values.len());
                 grid::nchw_from_nhwc(image.grid, &image.values, &mut planar);
-                (planar, None)
+                Ok((planar, None))
             }
         }
     }

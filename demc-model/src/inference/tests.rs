@@ -1,5 +1,7 @@
 //! Bands compared with whole maps. `demc-model/tests/inference.rs` compares with Burn's operations.
 
+use std::ops::ControlFlow;
+
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_kernels::conv3x3::Tile;
 use rand::{RngExt, SeedableRng};
@@ -49,9 +51,21 @@ fn plan(band: usize) -> BandPlan {
     }
 }
 
+fn pass(
+    model: &Denoiser,
+    images: [Tensor<4>; 2],
+    layers: Option<Tensor<4>>,
+    tile: Tile,
+    band: usize,
+) -> (Tensor<4>, Option<Tensor<4>>) {
+    let mut observer = |_| ControlFlow::Continue(());
+    let done = forward_with(model, images, layers, tile, plan(band), &mut observer);
+    done.expect("nobody cancels")
+}
+
 fn run(model: &Denoiser, size: [usize; 3], tile: Tile, band: usize) -> Vec<f32> {
     let [color, features] = images(size);
-    let (out, _) = forward_with(model, color, features, None, tile, plan(band));
+    let (out, _) = pass(model, [color, features], None, tile, band);
     out.into_data().try_to_vec().expect("float32")
 }
 
@@ -100,8 +114,7 @@ fn bands_filter_layers_as_whole_maps_do() {
     let run = |band| {
         let [color, features] = images([1, 160, 32]);
         let layers = images([2, 160, 32])[0].clone();
-        let (out, layers) =
-            forward_with(&model, color, features, Some(layers), Tile::F4, plan(band));
+        let (out, layers) = pass(&model, [color, features], Some(layers), Tile::F4, band);
         let host =
             |tensor: Tensor<4>| -> Vec<f32> { tensor.into_data().try_to_vec().expect("float32") };
         (host(out), host(layers.expect("layers")))
@@ -144,7 +157,55 @@ fn an_image_in_a_batch_has_the_bits_of_the_image_alone() {
     let size = [2, 96, 64];
     let both = run(&model, size, Tile::F4, 8);
     let [color, features] = images(size).map(|images| images.narrow(0, 1, 1));
-    let (out, _) = forward_with(&model, color, features, None, Tile::F4, plan(8));
+    let (out, _) = pass(&model, [color, features], None, Tile::F4, 8);
     let second: Vec<f32> = out.into_data().try_to_vec().expect("float32");
     assert!(both[second.len()..] == second);
+}
+
+#[test]
+fn progress_rises_to_the_end_on_whole_maps_and_in_bands() {
+    every_network(|model, name, size| {
+        for band in [8, WHOLE] {
+            let mut shares = Vec::new();
+            let mut observer = |share| {
+                shares.push(share);
+                ControlFlow::Continue(())
+            };
+            let done = forward_with(
+                model,
+                images(size),
+                None,
+                Tile::F4,
+                plan(band),
+                &mut observer,
+            );
+            done.expect("nobody cancels");
+            assert!(shares.is_sorted(), "{name}: {shares:?}");
+            let last = shares.last().expect("several calls");
+            assert!((0.99..=1.0).contains(last), "{name}, {band}: {last}");
+        }
+    });
+}
+
+#[test]
+fn every_call_of_the_observer_can_cancel() {
+    let model = network(Variant::Demc, Reading::Paper);
+    let run = |stop: usize| {
+        let mut calls = 0;
+        let mut observer = |_| {
+            calls += 1;
+            match calls == stop {
+                true => ControlFlow::Break(()),
+                false => ControlFlow::Continue(()),
+            }
+        };
+        let size = [1, 96, 64];
+        let done = forward_with(&model, images(size), None, Tile::F4, plan(8), &mut observer);
+        (done.is_ok(), calls)
+    };
+    let (done, all) = run(usize::MAX);
+    assert!(done && all > 20, "{all}");
+    for stop in 1..=all {
+        assert_eq!(run(stop), (false, stop));
+    }
 }

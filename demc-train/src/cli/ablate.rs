@@ -1,14 +1,13 @@
 //! `demc-train ablate`: compares variants.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
+use crate::config::utf8;
+use crate::ranks::Ranks;
+use crate::record::progress::say;
+use crate::tools::ablation::spec::AblationSpec;
+use crate::tools::ablation::{self, AblationOutcome};
 use clap::Args;
-use demc_train::config::utf8;
-use demc_train::ranks::Ranks;
-use demc_train::record::progress::say;
-use demc_train::tools::ablation::spec::AblationSpec;
-use demc_train::tools::ablation::{self, AblationOutcome};
 
 use super::compute::{ComputeArguments, stopped};
 
@@ -36,7 +35,7 @@ pub struct Arguments {
 }
 
 /// Trains and compares the variants.
-pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<ExitCode> {
+pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<u8> {
     let spec = AblationSpec::load(&arguments.config, &arguments.set);
     let mut spec = ranks.agree(spec.map_err(Into::into))?;
     if let Some(dir) = arguments.run_dir {
@@ -59,14 +58,14 @@ pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<ExitCode> {
         AblationOutcome::Stopped { signal, step } => {
             Ok(stopped(signal, step, "rerun the command to resume"))
         }
-        AblationOutcome::Done(None) => Ok(ExitCode::SUCCESS),
+        AblationOutcome::Done(None) => Ok(0),
         AblationOutcome::Done(Some(comparison)) => {
             let paths = ablation::write(&comparison, &spec.dir)?;
             say(format!("\n{}", ablation::markdown(&comparison)));
             for path in paths {
                 say(path.display());
             }
-            Ok(ExitCode::SUCCESS)
+            Ok(0)
         }
     }
 }

@@ -1,15 +1,13 @@
 //! Arguments of all subcommands that compute, and their exit after a signal.
 
-use std::process::ExitCode;
-
+use crate::ranks::{OnNode, Ranks};
+use crate::record::progress::say;
+use crate::run::session::SessionPlace;
+use crate::run::signals;
 use burn::tensor::Device;
 use clap::Args;
 use demc_infer::compute::ComputeFlags;
 use demc_infer::device;
-use demc_train::ranks::{OnNode, Ranks};
-use demc_train::record::progress::say;
-use demc_train::run::session::SessionPlace;
-use demc_train::run::signals;
 
 /// Device and implementation of the computation.
 #[derive(Debug, Args)]
@@ -49,12 +47,12 @@ fn device_of_rank(name: &str, on_node: OnNode) -> String {
 }
 
 /// Reports that a signal stopped the run after this step, and how to resume. Returns the exit code.
-pub(super) fn stopped(signal: i32, step: u64, how: &str) -> ExitCode {
+pub(super) fn stopped(signal: i32, step: u64, how: &str) -> u8 {
     say(format!(
         "\n{}: stopped after step {step}, everything is saved; {how}",
         signals::name(signal)
     ));
-    ExitCode::from(u8::try_from(signals::exit_code(signal)).unwrap_or(1))
+    u8::try_from(signals::exit_code(signal)).unwrap_or(1)
 }
 
 #[cfg(test)]

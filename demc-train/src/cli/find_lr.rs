@@ -1,17 +1,16 @@
 //! `demc-train find-lr`: suggests an initial learning rate.
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
+use crate::config::Config;
+use crate::ranks::{self, Ranks};
+use crate::record::progress::{StepProgress, say};
+use crate::run::data::{RunData, protect_inputs};
+use crate::tools::chart::with_extension;
+use crate::tools::find_lr::{RateRange, sweep};
 use clap::Args;
 use demc_data::message::{UsageError, printable};
 use demc_data::output::{Directories, Outputs};
-use demc_train::config::Config;
-use demc_train::ranks::{self, Ranks};
-use demc_train::record::progress::{StepProgress, say};
-use demc_train::run::data::{RunData, protect_inputs};
-use demc_train::tools::chart::with_extension;
-use demc_train::tools::find_lr::{RateRange, sweep};
 
 use super::compute::ComputeArguments;
 
@@ -55,7 +54,7 @@ pub struct Arguments {
 }
 
 /// Runs the sweep and prints its suggestion.
-pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<ExitCode> {
+pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<u8> {
     let Arguments {
         from, to, steps, ..
     } = arguments;
@@ -127,10 +126,10 @@ pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<ExitCode> {
         None => say("no suggestion: the loss never fell below that of the untrained network"),
     }
     if !ranks.is_first() {
-        return Ok(ExitCode::SUCCESS);
+        return Ok(0);
     }
     for path in found.write(&stem)? {
         say(path.display());
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(0)
 }

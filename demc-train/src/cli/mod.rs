@@ -6,10 +6,16 @@ mod find_lr;
 mod plot;
 mod train;
 
-use std::process::ExitCode;
+use std::ffi::OsString;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 
-use clap::{Parser, Subcommand};
-use demc_train::ranks::Ranks;
+use crate::ranks::{self, Launch, Ranks, SharedError};
+use clap::{CommandFactory, Parser, Subcommand};
+use demc_data::{message, parallel};
+use demc_infer::compute::on_threads;
+
+/// The exit code of a program that panicked.
+const PANICKED: u8 = 101;
 
 /// Train a DEMC Monte Carlo denoiser on rendered images.
 ///
@@ -25,7 +31,7 @@ use demc_train::ranks::Ranks;
     args_conflicts_with_subcommands = true,
     subcommand_negates_reqs = true
 )]
-pub struct Arguments {
+struct Arguments {
     #[command(subcommand)]
     subcommand: Option<SubcommandArguments>,
 
@@ -49,8 +55,54 @@ Examples:
   demc-train ablate --config configs/ablation.toml
   demc-train plot runs/mine runs/other";
 
-/// Runs the program.
-pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
+/// The command line's description, for manuals and completions.
+pub fn command() -> clap::Command {
+    Arguments::command()
+}
+
+/// Runs the program with its name and arguments. Returns the exit code.
+pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
+    let arguments = match Arguments::try_parse_from(arguments) {
+        Ok(arguments) => arguments,
+        Err(shown) => return message::usage(&shown),
+    };
+    let launch = match Launch::start() {
+        Ok(launch) => launch,
+        Err(error) => {
+            message::say(format_args!("error: {error}"));
+            return 1;
+        }
+    };
+    message::silence(!launch.is_first());
+    parallel::share_processors(launch.on_node().count);
+    if let Some(note) = &parallel::threads().note {
+        message::say(format_args!("note: {note}"));
+    }
+    let work = AssertUnwindSafe(|| on_threads(|| run(arguments)));
+    let done = catch_unwind(work).unwrap_or_else(|panic| {
+        // The other ranks would wait for this one.
+        ranks::abort(PANICKED);
+        resume_unwind(panic)
+    });
+    match done.map_err(anyhow::Error::from).flatten() {
+        Ok(code) => code,
+        Err(error) => {
+            let code = ranks::exit_code(&error);
+            match launch.name().filter(|_| !error.is::<SharedError>()) {
+                None => message::say(format_args!("error: {error:#}")),
+                // The other ranks know nothing of it and would wait for this one.
+                Some(name) => {
+                    message::silence(false);
+                    message::say(format_args!("error: {name}: {error:#}"));
+                    ranks::abort(code);
+                }
+            }
+            code
+        }
+    }
+}
+
+fn run(arguments: Arguments) -> anyhow::Result<u8> {
     let ranks = Ranks::world();
     match arguments.subcommand {
         Some(SubcommandArguments::FindLr(arguments)) => find_lr::run(arguments, &ranks),

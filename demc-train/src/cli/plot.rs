@@ -1,15 +1,14 @@
 //! `demc-train plot`: draws the curves of runs.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
+use crate::record::progress::say;
+use crate::tools::chart::with_extension;
+use crate::tools::plot::{PlotOptions, plot};
 use clap::Args;
 use demc_data::message::printable;
 use demc_data::output::{Directories, Outputs};
 use demc_infer::bundle::locate;
-use demc_train::record::progress::say;
-use demc_train::tools::chart::with_extension;
-use demc_train::tools::plot::{PlotOptions, plot};
 
 /// Draw loss and validation curves of one or more runs as SVG
 ///
@@ -35,7 +34,7 @@ pub struct Arguments {
 }
 
 /// Draws the curves.
-pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
+pub fn run(arguments: Arguments) -> anyhow::Result<u8> {
     let Arguments {
         runs,
         out,
@@ -54,5 +53,5 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         say(format!("note: {}", printable(&note)));
     }
     say(printable(&drawn.path.display().to_string()));
-    Ok(ExitCode::SUCCESS)
+    Ok(0)
 }

@@ -2,15 +2,14 @@
 
 use std::num::NonZero;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
+use crate::config::{Config, ConfigError, utf8};
+use crate::ranks::Ranks;
+use crate::record::progress::say;
+use crate::run::run_dir::{CONFIG, copy_in_checkpoint};
+use crate::run::session::{Session, SessionOptions, SessionOutcome};
 use clap::Args;
 use demc_data::message::printable;
-use demc_train::config::{Config, ConfigError, utf8};
-use demc_train::ranks::Ranks;
-use demc_train::record::progress::say;
-use demc_train::run::run_dir::{CONFIG, copy_in_checkpoint};
-use demc_train::run::session::{Session, SessionOptions, SessionOutcome};
 
 use super::compute::{ComputeArguments, stopped};
 
@@ -78,7 +77,7 @@ fn with_copy(error: ConfigError, config: &Path) -> ConfigError {
 }
 
 /// Trains a run, new or resumed.
-pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<ExitCode> {
+pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<u8> {
     let mut sets = arguments.set;
     if let Some(dir) = &arguments.run_dir {
         sets.push(ranks.agree(run_dir_set(dir).map_err(Into::into))?);
@@ -126,7 +125,7 @@ pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<ExitCode> {
                 "check: training is possible, but see the warnings; nothing was written".to_owned()
             }
         });
-        return Ok(ExitCode::SUCCESS);
+        return Ok(0);
     }
     say(format!("run: {}\n", shown(&dir)));
     match session.finish()? {
@@ -144,5 +143,5 @@ pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<ExitCode> {
         }
     }
     say(format!("\nweights, pictures and scores: {}", shown(&dir)));
-    Ok(ExitCode::SUCCESS)
+    Ok(0)
 }

@@ -3,6 +3,7 @@
 pub mod checkpoint;
 pub mod data;
 pub mod initial;
+pub mod observer;
 pub mod run_dir;
 pub mod run_record;
 pub mod session;

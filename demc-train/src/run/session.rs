@@ -17,7 +17,9 @@ use crate::ranks::{self, Ranks};
 use crate::run::checkpoint::store::{CheckpointSearch, CheckpointStore};
 use crate::run::checkpoint::{self, Checkpoint};
 use crate::run::data::{RunData, protect_inputs};
+use crate::run::observer::TakenStep;
 use crate::run::run_dir::{self, RunDir};
+use crate::run::signals::Signals;
 use crate::run::training::{LoopEnd, TrainingRun};
 use crate::tools::estimate::{ClusterEstimate, DurationEstimate, check_memory};
 
@@ -218,12 +220,25 @@ impl Session {
         Ok(format!("{cluster}; {hours:.1} hours for {steps} steps"))
     }
 
-    /// Trains and scores.
+    /// Trains and scores. The first signal of a user or a batch system stops the training.
     ///
     /// # Errors
     /// Those of [`TrainingRun::train`] and [`TrainingRun::test`].
-    pub fn finish(mut self) -> anyhow::Result<SessionOutcome> {
-        match self.run.train(&self.place.device_name)? {
+    pub fn finish(self) -> anyhow::Result<SessionOutcome> {
+        let signals = Signals::listen()?;
+        self.finish_observed(move |_| signals.received())
+    }
+
+    /// As [`finish`](Self::finish), but signals are the caller's: `observer` hears of every step, and
+    /// the number of a signal that it returns stops the training.
+    ///
+    /// # Errors
+    /// As [`finish`](Self::finish).
+    pub fn finish_observed(
+        mut self,
+        observer: impl FnMut(&TakenStep) -> Option<i32>,
+    ) -> anyhow::Result<SessionOutcome> {
+        match self.run.train(&self.place.device_name, observer)? {
             LoopEnd::Stopped { signal, step } => Ok(SessionOutcome::Stopped { signal, step }),
             LoopEnd::Done => {
                 let scores = self.run.test(&self.place.device)?;

@@ -19,9 +19,9 @@ use crate::run::checkpoint::store::CheckpointStore;
 use crate::run::checkpoint::{self, Checkpoint, LoopState, MetricSums, SessionClock};
 use crate::run::data::{RunData, rank_loader};
 use crate::run::initial::{InitialNetwork, InitialWeights, initial_network};
+use crate::run::observer::TakenStep;
 use crate::run::run_dir::RunDir;
 use crate::run::run_record::RunFacts;
-use crate::run::signals::Signals;
 use crate::run::validation::Validation;
 use crate::run::warnings::LoopFacts;
 use crate::step::optimizer::{DormantChannels, Optimizer};
@@ -166,13 +166,17 @@ impl TrainingRun {
         self.config.model.parameter_count()
     }
 
-    /// Trains to the last step or the first signal. `device` is the name of the device for the
-    /// record.
+    /// Trains to the last step, or until `observer`, which hears of every step, returns a signal.
+    /// `device` is the name of the device for the record.
     ///
     /// # Errors
     /// A scene that cannot be read; a file that cannot be written; a non-finite loss in a step
     /// that may not be skipped, or in all steps.
-    pub fn train(&mut self, device: &str) -> anyhow::Result<LoopEnd> {
+    pub fn train(
+        &mut self,
+        device: &str,
+        mut observer: impl FnMut(&TakenStep) -> Option<i32>,
+    ) -> anyhow::Result<LoopEnd> {
         let mut recorder = self.open_records(device)?;
         let (train, run) = (self.config.train.clone(), self.config.run.clone());
         let rate = self.config.learning_rate();
@@ -181,7 +185,6 @@ impl TrainingRun {
         let per_step = train.grad_accumulation;
         let source = self.source.clone();
         let mut loader = rank_loader(source, &self.ranks, per_step, self.state.step);
-        let signals = Signals::listen()?;
         let mut clock = SessionClock::new(self.state.elapsed_s, run.checkpoint_interval());
         while self.state.step < train.steps {
             let lr = rate.at(self.state.step);
@@ -211,7 +214,9 @@ impl TrainingRun {
             for warning in warnings {
                 recorder.say(&format!("warning: step {step}: {warning}"));
             }
-            let (signal, is_time) = self.requests(signals.received(), clock.checkpoint_is_due())?;
+            let taken = TakenStep::new([step, train.steps], &report, lr, validation.as_ref());
+            let signal = observer(&taken);
+            let (signal, is_time) = self.requests(signal, clock.checkpoint_is_due())?;
             if due(run.checkpoint_every) || is_time || signal.is_some() {
                 self.save()?;
                 clock.checkpoint_saved();

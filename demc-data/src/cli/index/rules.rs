@@ -3,9 +3,9 @@
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
+use crate::Split;
+use crate::message::printable;
 use anyhow::Result;
-use demc_data::Split;
-use demc_data::message::printable;
 use glob::Pattern;
 use regex_lite::Regex;
 
