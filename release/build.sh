@@ -26,15 +26,16 @@ tools=$PWD/target/release-tools
     "$tools/bin/pip" install -q cargo-zigbuild==0.24.* ziglang==0.17.*
 }
 PATH=$tools/bin:$PATH
-export CARGO_PROFILE_RELEASE_STRIP=symbols CARGO_INCREMENTAL=0
+export CARGO_INCREMENTAL=0
 
 # Builds for a target: build TARGET OPTION...
-build() {
+build() (
     target=$1
     shift
+    export CARGO_PROFILE_RELEASE_STRIP=symbols
     if [ -e "$(rustc --print sysroot)/lib/rustlib/$target/lib" ] || rustup target add "$target" 2>/dev/null; then
         cargo zigbuild --release --target "$target" "$@"
-        return
+        exit
     fi
     [ -e "$(rustc --print sysroot)/lib/rustlib/src/rust/library/std" ] || {
         echo "error: no standard library for $target: install it with rustup, or the component rust-src" >&2
@@ -43,7 +44,7 @@ build() {
     # Building the standard library is a feature of nightly compilers that this variable permits.
     RUSTC_BOOTSTRAP=1 RUSTFLAGS="-C link-self-contained=no" \
         cargo zigbuild --release --target "$target" -Z build-std=std,panic_unwind "$@"
-}
+)
 
 version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
 mkdir -p dist
