@@ -16,6 +16,9 @@ COMMANDS = {
     "cargo run -p demc-infer --example frame": ["-p", "demc-infer", "-e", "normal,build,dev"],
     "cargo run -p demc-train": ["-p", "demc-train", "-e", "normal,build"],
     "cargo bench -p demc-bench": ["-p", "demc-bench", "-e", "normal,build,dev"],
+    "cargo run -p demc-train --example manuals": ["-p", "demc-train", "-e", "normal,build,dev"],
+    "cargo build -p demc-c": ["-p", "demc-c", "-e", "normal,build"],
+    "cargo build -p demc-python": ["-p", "demc-python", "-e", "normal,build"],
     "the library of demc-infer": ["-p", "demc-infer", "--no-default-features", "-e", "normal,build"],
 }
 

@@ -7,9 +7,7 @@
 # their SHA256SUMS are written to dist/. Each archive has the programs, manual pages, completions for
 # bash, zsh, and fish, and the licences of all crates.
 #
-# It needs cargo and Python 3.11. The linker is zig, which pip installs into target/release-tools. The
-# standard library of a target comes from rustup, or is built from the source in the toolchain's
-# lib/rustlib/src (the rust-src component) where rustup reaches no server.
+# It needs cargo and Python 3.11; release/cargo.sh says how it links and where a standard library comes from.
 set -eu
 
 programs="demc-infer demc-train demc-data"
@@ -20,32 +18,7 @@ fi
 [ $# -gt 0 ] || set -- x86_64-unknown-linux-musl aarch64-unknown-linux-musl
 
 cd "$(dirname "$0")/.."
-tools=$PWD/target/release-tools
-[ -x "$tools/bin/cargo-zigbuild" ] || {
-    python3 -m venv "$tools"
-    "$tools/bin/pip" install -q cargo-zigbuild==0.24.* ziglang==0.17.*
-}
-PATH=$tools/bin:$PATH
 export CARGO_INCREMENTAL=0
-
-# Builds for a target: build TARGET OPTION...
-build() (
-    target=$1
-    shift
-    export CARGO_PROFILE_RELEASE_STRIP=symbols
-    if [ -e "$(rustc --print sysroot)/lib/rustlib/$target/lib" ] || rustup target add "$target" 2>/dev/null; then
-        cargo zigbuild --release --target "$target" "$@"
-        exit
-    fi
-    [ -e "$(rustc --print sysroot)/lib/rustlib/src/rust/library/std" ] || {
-        echo "error: no standard library for $target: install it with rustup, or the component rust-src" >&2
-        exit 1
-    }
-    # Building the standard library is a feature of nightly compilers that this variable permits.
-    RUSTC_BOOTSTRAP=1 RUSTFLAGS="-C link-self-contained=no" \
-        cargo zigbuild --release --target "$target" -Z build-std=std,panic_unwind "$@"
-)
-
 version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
 mkdir -p dist
 documents=$PWD/target/release-documents
@@ -61,7 +34,7 @@ for program in $programs; do
 done
 for target; do
     # shellcheck disable=SC2086
-    build "$target" $packages
+    release/cargo.sh "$target" zigbuild $packages
     name=demc-$version-$target
     folder=$PWD/target/release-archive/$name
     rm -rf "$folder"

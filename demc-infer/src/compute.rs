@@ -1,5 +1,7 @@
 //! `--ops` and `--isa`: operations and instruction set, for all commands that run a network.
 
+use std::sync::{Mutex, PoisonError};
+
 use burn::tensor::Device;
 use demc_model::ops::{self, ISA_VARIABLE, Isa, Ops, UnknownIsa};
 
@@ -61,11 +63,23 @@ impl ComputeFlags {
 const LEAST_MEMORY: u64 = 128 << 20;
 
 /// Runs a program's `work` on one of its threads: as many as `RAYON_NUM_THREADS` asks for, at most
-/// four per processor ([`demc_data::parallel::threads`]).
+/// four per processor ([`demc_data::parallel::threads`]). The first call starts them.
 ///
 /// # Errors
 /// The process's limits leave too little memory or too few threads.
 pub fn on_threads<R: Send>(work: impl FnOnce() -> R + Send) -> Result<R, StartError> {
+    static STARTED: Mutex<bool> = Mutex::new(false);
+    let mut started = STARTED.lock().unwrap_or_else(PoisonError::into_inner);
+    if !*started {
+        start()?;
+        *started = true;
+    }
+    drop(started);
+    Ok(ops::within_pool(work))
+}
+
+/// Starts the threads.
+fn start() -> Result<(), StartError> {
     if let Some(left) = memory::below_own_limits().filter(|left| *left < LEAST_MEMORY) {
         let left = left >> 20;
         return Err(StartError::Memory { left });
@@ -74,8 +88,7 @@ pub fn on_threads<R: Send>(work: impl FnOnce() -> R + Send) -> Result<R, StartEr
     ops::start_threads(count).map_err(|error| StartError::Threads {
         count,
         reason: error.to_string(),
-    })?;
-    Ok(ops::within_pool(work))
+    })
 }
 
 /// The process's limits are too low for any work.

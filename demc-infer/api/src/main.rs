@@ -15,7 +15,9 @@ const GOLDEN: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/api.txt");
 
 fn main() -> Result<ExitCode, Box<dyn Error>> {
     let mut arguments = std::env::args().skip(1);
-    let json = arguments.next().ok_or("usage: demc-infer-api RUSTDOC.json [--write]")?;
+    let json = arguments
+        .next()
+        .ok_or("usage: demc-infer-api RUSTDOC.json [--write]")?;
     let api = public_api::Builder::from_rustdoc_json(json)
         .omit_blanket_impls(true)
         .omit_auto_trait_impls(true)
@@ -36,7 +38,9 @@ fn main() -> Result<ExitCode, Box<dyn Error>> {
         println!("+ {line}");
     }
     if golden != found {
-        println!("the public API differs from api.txt; `demc-infer/api/check.sh --write` accepts it");
+        println!(
+            "the public API differs from api.txt; `demc-infer/api/check.sh --write` accepts it"
+        );
         return Ok(ExitCode::FAILURE);
     }
     println!("{} public items, as in api.txt", found.len());

@@ -143,7 +143,7 @@ fn planes(
             }
         }
     }
-    let Some(first) = planar.iter().position(|value| is_bad(value)) else {
+    let Some(first) = planar.iter().position(is_bad) else {
         return Ok(planar);
     };
     Err(BufferError::NonFinite {

@@ -20,10 +20,10 @@ def onnx(file):
 
 
 def torch(file):
-    import demc
+    import demc.torch
     import torch
 
-    bundle = demc.load(file)
+    bundle = demc.torch.load(file)
     version = f"PyTorch {torch.__version__}"
     return version, lambda color, features: numpy.stack([bundle.denoise(*image) for image in zip(color, features)])
 
