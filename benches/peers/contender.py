@@ -53,12 +53,12 @@ class TorchTraining:
         )
 
     def loss(self):
-        import demc
+        import demc.torch
 
         color, features, reference = self.inputs
         with autocast(self.torch, self.device, self.dtype):
             output = self.forward(color, features)
-        return demc.rel_mse(demc.hdr_from_gamma(output.float()), reference)
+        return demc.torch.rel_mse(demc.torch.hdr_from_gamma(output.float()), reference)
 
     def step(self) -> float:
         self.adam.zero_grad()
@@ -168,14 +168,14 @@ def load_torch(args: argparse.Namespace):
     import torch
     from safetensors.torch import load_file
 
-    import demc
+    import demc.torch
 
     torch.set_num_threads(args.threads)
     precision = "tf32" if args.dtype == "tf32" else "ieee"
     torch.backends.cuda.matmul.fp32_precision = torch.backends.cudnn.conv.fp32_precision = precision
     torch.backends.cudnn.benchmark = True
     layout = torch.contiguous_format if args.kind == "nchw" else torch.channels_last
-    model = demc.load(args.weights).model.to(device=args.device, memory_format=layout)
+    model = demc.torch.load(args.weights).model.to(device=args.device, memory_format=layout)
     tensors = load_file(args.inputs)
     inputs = [tensors[name].to(device=args.device, memory_format=layout) for name in (*NAMES, "reference_hdr")]
     return torch, model, inputs

@@ -105,6 +105,11 @@ pub fn silence(silent: bool) {
     SILENT.store(silent, Ordering::Relaxed);
 }
 
+/// Whether this process prints nothing.
+pub fn is_silent() -> bool {
+    SILENT.load(Ordering::Relaxed)
+}
+
 /// Prints a message as one line on standard error. Very long messages are cut. A closed or full
 /// stream is ignored.
 pub fn say(message: impl Display) {

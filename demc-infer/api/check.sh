@@ -13,4 +13,4 @@ chmod +x "$wrapper"
 export DOCS_RS=1
 RUSTDOC=$wrapper RUSTDOCFLAGS="-Z unstable-options --output-format json" \
     cargo doc --workspace --no-deps --all-features --quiet
-cargo run --release --quiet --manifest-path demc-infer/api/Cargo.toml -- target/doc/demc_infer.json "$@"
+cargo run --release --quiet --manifest-path demc-infer/api/Cargo.toml --target-dir target/api -- target/doc/demc_infer.json "$@"

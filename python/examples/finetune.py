@@ -1,6 +1,6 @@
 """Fine-tunes an export of `demc-infer export --names torch` on a data set, in PyTorch.
 
-pip install ./python (in the repository root). `demc-infer import OUTPUT -o FILE` loads the result.
+pip install './python[torch]' (in the repository root). `demc-infer import OUTPUT -o FILE` loads the result.
 """
 
 import argparse
@@ -8,7 +8,7 @@ import json
 import sys
 from pathlib import Path
 
-import demc
+import demc.torch
 import torch
 from safetensors.torch import save_file
 from torch.utils.data import DataLoader, Dataset
@@ -19,7 +19,7 @@ CROP = 128  # Height and width of the crops, in pixels; a multiple of 32.
 class Crops(Dataset):
     """One random crop of each training scene: colour, features, and reference."""
 
-    def __init__(self, root: Path, bundle: demc.Bundle, layout: str | None) -> None:
+    def __init__(self, root: Path, bundle: demc.torch.Bundle, layout: str | None) -> None:
         scenes = json.loads((root / "manifest.json").read_text())["scenes"]
         self.paths = [root / scene["file"] for scene in scenes if scene["split"] == "train"]
         self.meta, self.layout = bundle.meta, layout
@@ -28,11 +28,11 @@ class Crops(Dataset):
         return len(self.paths)
 
     def __getitem__(self, index: int) -> tuple[torch.Tensor, ...]:
-        frame = demc.read_exr(self.paths[index], self.layout, bundle=self.meta)
+        frame = demc.torch.read_exr(self.paths[index], self.layout, bundle=self.meta)
         if frame.reference is None or min(frame.color.shape[1:]) < CROP:
             raise ValueError(f"{self.paths[index]}: expected a reference and {CROP}x{CROP} pixels")
         # Exposure and positions need the whole image.
-        color, features, scale = demc.preprocess.prepare(frame.color, frame.features, self.meta)
+        color, features, scale = demc.torch.preprocess.prepare(frame.color, frame.features, self.meta)
         top, left = (int(torch.randint(size - CROP + 1, ())) for size in color.shape[1:])
         crop = lambda image: torch.from_numpy(image[:, top : top + CROP, left : left + CROP].copy())
         return crop(color), crop(features), crop(frame.reference * scale)
@@ -50,7 +50,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    bundle = demc.load(arguments.model).to(device)
+    bundle = demc.torch.load(arguments.model).to(device)
     crops = DataLoader(Crops(arguments.data, bundle, arguments.layout), arguments.batch, shuffle=True)
     optimizer = torch.optim.Adam(bundle.model.parameters(), arguments.lr)
     bundle.model.train()
@@ -58,7 +58,7 @@ def main() -> None:
     while step < arguments.steps:
         for color, features, reference in crops:
             output = bundle.radiance(color.to(device), features.to(device))
-            loss = demc.rel_mse(output, reference.to(device))
+            loss = demc.torch.rel_mse(output, reference.to(device))
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

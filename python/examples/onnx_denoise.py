@@ -1,14 +1,13 @@
 """Denoises an EXR file of any renderer with an ONNX file of `demc-infer export`.
 
-pip install onnxruntime ./python (in the repository root). PyTorch is not used; without it:
-pip install onnxruntime numpy OpenEXR && pip install --no-deps ./python
+pip install onnxruntime OpenEXR ./python (in the repository root). PyTorch is not used.
 """
 
 import argparse
 import json
 import sys
 
-import demc
+import demc.torch
 import onnxruntime
 
 parser = argparse.ArgumentParser(description=__doc__)
@@ -21,14 +20,14 @@ arguments = parser.parse_args()
 session = onnxruntime.InferenceSession(arguments.model, providers=["CPUExecutionProvider"])
 meta = json.loads(session.get_modelmeta().custom_metadata_map["demc"])
 try:
-    frame = demc.read_exr(arguments.input, arguments.layout, arguments.layer, meta)
+    frame = demc.torch.read_exr(arguments.input, arguments.layout, arguments.layer, meta)
     print(frame.layout.describe())
-    color, features, scale = demc.preprocess.prepare(frame.color, frame.features, meta)
-    color, features = (demc.preprocess.pad(image)[None] for image in (color, features))
+    color, features, scale = demc.torch.preprocess.prepare(frame.color, frame.features, meta)
+    color, features = (demc.torch.preprocess.pad(image)[None] for image in (color, features))
     [output] = session.run(["output"], {"color": color, "features": features})
     height, width = frame.color.shape[1:]
     image = output[0, :, :height, :width] / scale
-    image *= demc.light.factors(frame.color, image, meta)
+    image *= demc.torch.light.factors(frame.color, image, meta)
     frame.write(arguments.output, image, precision="float")
 except (OSError, ValueError) as error:
     sys.exit(f"error: {error}")

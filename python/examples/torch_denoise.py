@@ -1,12 +1,12 @@
 """Denoises an EXR file of any renderer in PyTorch with a bundle of `demc-infer export`.
 
-pip install ./python (in the repository root)
+pip install './python[torch]' (in the repository root)
 """
 
 import argparse
 import sys
 
-import demc
+import demc.torch
 
 parser = argparse.ArgumentParser(description=__doc__)
 for name in ("model", "input", "output"):
@@ -17,8 +17,8 @@ parser.add_argument("--layers", action="append", default=[], metavar="PATTERN", 
 arguments = parser.parse_args()
 
 try:
-    bundle = demc.load(arguments.model)
-    frame = demc.read_exr(arguments.input, arguments.layout, arguments.layer, bundle)
+    bundle = demc.torch.load(arguments.model)
+    frame = demc.torch.read_exr(arguments.input, arguments.layout, arguments.layer, bundle)
     print(frame.layout.describe())
     image, layers = bundle.denoise_with_layers(frame.color, frame.features, frame.layers(*arguments.layers))
     frame.write(arguments.output, image, precision="float", layers=layers)

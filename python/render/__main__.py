@@ -31,8 +31,8 @@ from rooms import Room
 from stills import Still
 from variant import mi
 
-from demc.files import write_json, write_text  # `views` puts the package on the path.
-from demc.shard import add_shard_flag
+from demc.torch.files import write_json, write_text  # `views` puts the package on the path.
+from demc.torch.shard import add_shard_flag
 
 NOISE = (0.2, 16.0)
 """Range of RelMSE of a room's noisy image. Views outside it are left out."""
@@ -46,7 +46,7 @@ NEAR, STILL_NEAR = 0.5, 0.15
 
 COUNTS = [1, 2, 4, 8, 16, 32, 64, 128, 256]
 PRESETS = {
-    "train": {"rooms": 900, "stills": 500, "size": 192, "spp": COUNTS, "counts": 1, "traits": 0.25, "seed": 29},
+    "train": {"rooms": 680, "stills": 380, "size": 192, "spp": COUNTS, "counts": 1, "traits": 0.25, "seed": 29},
     "heldout": {
         "rooms": 78, "stills": 20, "views": 1, "size": 256, "spp": COUNTS[::2], "ref_spp": 2048, "residual": 0.0,
         "reserved": True, "split": "test", "seed": 1029,
@@ -110,9 +110,10 @@ def main() -> None:
 
 
 def drawn_counts(args, rng: np.random.Generator) -> list[int]:
-    """The numbers of samples per pixel of a view's noisy images, in order."""
-    chosen = rng.permutation(len(args.spp))[: args.counts or len(args.spp)]
-    return sorted(args.spp[index] for index in chosen)
+    """The numbers of samples per pixel of a view's noisy images, in order. Small ones are drawn more often."""
+    chances = 1 / np.sqrt(args.spp)
+    number = min(args.counts or len(args.spp), len(args.spp))
+    return sorted(int(count) for count in rng.choice(args.spp, number, replace=False, p=chances / chances.sum()))
 
 
 def own_scenes(args, budget: views.Budget) -> Iterator[Base]:
@@ -206,7 +207,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--black", type=float, default=0.2, metavar="SHARE", help="share of the rooms with black bars and blinds [0.2]")
     parser.add_argument("--studio", type=float, default=0.15, metavar="SHARE", help="share of the still lifes in a black studio [0.15]")
     parser.add_argument("--spp", type=numbers, default=[4], metavar="N,...", help="samples per pixel of the noisy images [4]")
-    parser.add_argument("--counts", type=int, metavar="N", help="number of noisy images per view, drawn from --spp [all]")
+    parser.add_argument("--counts", type=int, metavar="N", help="number of noisy images per view, drawn from --spp, small ones more often [all]")
     parser.add_argument("--traits", type=float, default=0.0, metavar="SHARE", help="share of the views with a Gaussian pixel filter, with albedo behind glass, and with another exposure, each [0]")
     parser.add_argument("--ref-spp", type=int, default=128, metavar="N", help="largest number of samples per pixel of the reference [128]")
     parser.add_argument("--residual", type=float, default=0.03, metavar="X", help="expected RelMSE at which a reference is good enough [0.03]")

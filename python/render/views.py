@@ -14,7 +14,7 @@ import tracer
 # The package of this checkout.
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
-from demc.exr import write_whole
+from demc.torch.exr import write_whole
 
 LUMINANCE = 0.22
 """Mean luminance after scaling, without the brightest pixels."""

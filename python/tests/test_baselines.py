@@ -39,7 +39,7 @@ class Baselines(Tools):
     def relmse(self, denoiser: str) -> list[tuple[float, float]]:
         """RelMSE of the noisy and of the denoised image, per scene."""
         import numpy as np
-        from demc.exr import ExrFile
+        from demc.torch.exr import ExrFile
 
         scores = []
         with tempfile.TemporaryDirectory() as out:
@@ -83,7 +83,7 @@ class References(Tools):
     def test_only_training_references_change_and_they_are_cleaner(self) -> None:
         import numpy as np
         from dataset import manifest
-        from demc.exr import ExrFile
+        from demc.torch.exr import ExrFile
         from references import noise
 
         names = ["ref.R", "ref.G", "ref.B"]
@@ -134,7 +134,7 @@ class References(Tools):
     def test_guides_come_from_the_references_samples_if_present(self) -> None:
         import numpy as np
         from dataset import albedo, manifest
-        from demc.exr import read_exr
+        from demc.torch.exr import read_exr
         from oidn import prefiltered
         from references import guide
 
@@ -160,7 +160,7 @@ class OtherRenderers(Tools):
     def setUp(self) -> None:
         super().setUp()
         import OpenEXR
-        from demc.exr import ExrFile
+        from demc.torch.exr import ExrFile
 
         directory = tempfile.TemporaryDirectory()
         self.addCleanup(directory.cleanup)
@@ -181,7 +181,7 @@ class OtherRenderers(Tools):
         return ended.stderr
 
     def test_references_keep_all_parts_and_channels(self) -> None:
-        from demc.exr import ExrFile
+        from demc.torch.exr import ExrFile
 
         ended = run("references", "--data", self.data, "-o", self.out)
         self.assertEqual(ended.returncode, 0, ended.stderr)
@@ -192,7 +192,7 @@ class OtherRenderers(Tools):
         self.assertEqual(set(was.channels) - same, {"ref.R", "ref.G", "ref.B"})
 
     def test_baselines_denoise_and_take_a_layer(self) -> None:
-        from demc.exr import ExrFile
+        from demc.torch.exr import ExrFile
 
         for layer in ([], ["--layer", "ViewLayer"], ["--layout", "cycles"]):
             ended = run("baselines", "oidn", "--data", self.data, "-o", self.out, *layer)

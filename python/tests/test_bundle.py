@@ -1,4 +1,4 @@
-"""Tests of `demc.load`: run `python -m unittest discover -s tests` in `python/`."""
+"""Tests of `demc.torch.load`: run `python -m unittest discover -s tests` in `python/`."""
 
 import json
 import os
@@ -9,7 +9,7 @@ import unittest
 from dataclasses import asdict
 from pathlib import Path
 
-import demc
+import demc.torch
 import numpy as np
 import torch
 from safetensors.torch import save_file
@@ -22,8 +22,8 @@ class Headers(unittest.TestCase):
         directory = tempfile.TemporaryDirectory()
         self.addCleanup(directory.cleanup)
         self.path = Path(directory.name) / "x.safetensors"
-        config = demc.ModelConfig(width=2)
-        self.weights = demc.Denoiser(config).state_dict()
+        config = demc.torch.ModelConfig(width=2)
+        self.weights = demc.torch.Denoiser(config).state_dict()
         features = {"mean": [0.0] * 12, "std": [1.0] * 12}
         self.meta = {
             "format": 1,
@@ -38,23 +38,23 @@ class Headers(unittest.TestCase):
 
     def test_a_whole_header_loads(self) -> None:
         self.write()
-        self.assertEqual(demc.load(self.path).step, 7)
+        self.assertEqual(demc.torch.load(self.path).step, 7)
 
     def test_a_checksum_is_compared_and_left_out_of_the_header(self) -> None:
         blank = json.dumps(self.meta | {"sha256": ""})
-        self.meta["sha256"] = demc.bundle.checksum(blank, self.weights)
+        self.meta["sha256"] = demc.torch.bundle.checksum(blank, self.weights)
         self.write()
-        self.assertNotIn("sha256", demc.load(self.path).meta)
+        self.assertNotIn("sha256", demc.torch.load(self.path).meta)
         name = next(iter(self.weights))
         self.weights[name] = self.weights[name] + 1
         self.write()
         with self.assertRaisesRegex(ValueError, "damaged: its checksum differs"):
-            demc.load(self.path)
+            demc.torch.load(self.path)
 
     def with_filter(self) -> None:
         torch.manual_seed(3)
-        config = demc.ModelConfig("semc", width=2)
-        model = demc.Denoiser(config)
+        config = demc.torch.ModelConfig("semc", width=2)
+        model = demc.torch.Denoiser(config)
         with torch.no_grad():
             for weight in model.parameters():
                 weight += torch.empty_like(weight).uniform_(-0.05, 0.06)
@@ -63,10 +63,10 @@ class Headers(unittest.TestCase):
 
     def test_an_albedo_filter_is_applied_and_comes_back(self) -> None:
         self.write()
-        plain = demc.load(self.path)
+        plain = demc.torch.load(self.path)
         self.with_filter()
         self.write()
-        bundle = demc.load(self.path)
+        bundle = demc.torch.load(self.path)
         self.assertEqual((bundle.step, bundle.albedo_filter.step), (7, 9))
         self.assertIsNone(bundle.albedo_filter.albedo_filter)
         self.assertEqual(bundle.tensors().keys(), self.weights.keys())
@@ -90,7 +90,7 @@ class Headers(unittest.TestCase):
 
         meta = bundle.meta
         save_file(bundle.tensors(), self.path, {"demc": json.dumps(meta)})
-        again = demc.load(self.path).albedo_filter.model.state_dict()
+        again = demc.torch.load(self.path).albedo_filter.model.state_dict()
         self.assertTrue(all(torch.equal(weight, again[name]) for name, weight in bundle.albedo_filter.model.state_dict().items()))
 
     def test_a_wrong_albedo_filter_is_named(self) -> None:
@@ -98,21 +98,21 @@ class Headers(unittest.TestCase):
         bias = self.weights.pop("albedo_filter.decoder.head.bias")
         self.write()
         with self.assertRaisesRegex(ValueError, "albedo_filter .*decoder.head.bias"):
-            demc.load(self.path)
+            demc.torch.load(self.path)
         self.weights["albedo_filter.decoder.head.bias"] = bias
         self.meta["albedo_filter"]["normalizer"] = self.meta["normalizer"] | {"position": "image"}
         self.write()
         with self.assertRaisesRegex(ValueError, "other positions"):
-            demc.load(self.path)
+            demc.torch.load(self.path)
         del self.meta["albedo_filter"]["step"]
         self.write()
         with self.assertRaisesRegex(ValueError, "no key albedo_filter.step$"):
-            demc.load(self.path)
+            demc.torch.load(self.path)
         # Without its header entry, the tensors are superfluous.
         del self.meta["albedo_filter"]
         self.write()
         with self.assertRaisesRegex(ValueError, "Unexpected.*albedo_filter"):
-            demc.load(self.path)
+            demc.torch.load(self.path)
 
     def test_a_missing_key_is_named(self) -> None:
         for keys in (
@@ -130,26 +130,26 @@ class Headers(unittest.TestCase):
             value = parent.pop(keys[-1])
             self.write()
             with self.subTest(keys), self.assertRaisesRegex(ValueError, f"no key {'.'.join(keys)}$"):
-                demc.load(self.path)
+                demc.torch.load(self.path)
             parent[keys[-1]] = value
 
     def test_a_file_without_levels_has_those_of_the_paper(self) -> None:
         del self.meta["model"]["levels"]
         self.write()
-        self.assertEqual(demc.load(self.path).model.config.levels, (1, 2, 4, 8, 8))
+        self.assertEqual(demc.torch.load(self.path).model.config.levels, (1, 2, 4, 8, 8))
 
     def test_levels_are_those_of_the_file(self) -> None:
-        config = demc.ModelConfig(width=2, levels=(2, 3, 1, 1, 2))
-        self.weights = demc.Denoiser(config).state_dict()
+        config = demc.torch.ModelConfig(width=2, levels=(2, 3, 1, 1, 2))
+        self.weights = demc.torch.Denoiser(config).state_dict()
         self.meta["model"] = asdict(config)
         self.write()
-        model = demc.load(self.path).model
+        model = demc.torch.load(self.path).model
         self.assertEqual(model.config, config)
         self.assertEqual(model.latent.conv.weight.shape, (4, 4, 3, 3))
 
     def test_the_name_contains_levels_that_differ_from_the_paper(self) -> None:
-        self.assertEqual(str(demc.ModelConfig(width=3)), "demc, paper reading, width 3")
-        name = str(demc.ModelConfig(width=3, levels=(1, 2, 2, 4, 1)))
+        self.assertEqual(str(demc.torch.ModelConfig(width=3)), "demc, paper reading, width 3")
+        name = str(demc.torch.ModelConfig(width=3, levels=(1, 2, 2, 4, 1)))
         self.assertEqual(name, "demc, paper reading, width 3, levels of [3, 6, 6, 12, 3]")
 
     def test_levels_are_five(self) -> None:
@@ -157,13 +157,13 @@ class Headers(unittest.TestCase):
             self.meta["model"]["levels"] = levels
             self.write()
             with self.assertRaisesRegex(ValueError, "expected five numbers of at least 1"):
-                demc.load(self.path)
+                demc.torch.load(self.path)
 
-    def kernel_bundle(self) -> demc.Bundle:
+    def kernel_bundle(self) -> demc.torch.Bundle:
         """A network whose kernels differ from pixel to pixel, with albedo demodulation."""
         torch.manual_seed(4)
-        config = demc.ModelConfig(width=2, head="kernel")
-        model = demc.Denoiser(config)
+        config = demc.torch.ModelConfig(width=2, head="kernel")
+        model = demc.torch.Denoiser(config)
         with torch.no_grad():
             for weight in model.decoder.kernels.parameters():
                 weight.uniform_(-1, 1)
@@ -171,7 +171,7 @@ class Headers(unittest.TestCase):
         self.meta["model"] = asdict(config)
         self.meta["normalizer"] |= {"demodulate": 0.07, "exposure_level": 0.13}
         self.write()
-        return demc.load(self.path)
+        return demc.torch.load(self.path)
 
     def test_layers_that_add_up_to_the_colour_still_do(self) -> None:
         bundle = self.kernel_bundle()
@@ -197,7 +197,7 @@ class Headers(unittest.TestCase):
         self.write()
         color, features = np.ones((3, 8, 8)), np.ones((12, 8, 8))
         with self.assertRaisesRegex(ValueError, 'head "kernel"; this one has "grey"'):
-            demc.load(self.path).denoise_with_layers(color, features, {"A": color[0]})
+            demc.torch.load(self.path).denoise_with_layers(color, features, {"A": color[0]})
         bundle = self.kernel_bundle()
         for plane, words in ((np.ones((8, 7)), r"\[8, 7\]: expected \[8, 8\]"), (np.full((8, 8), np.nan), "NaN")):
             with self.assertRaisesRegex(ValueError, f"layer lamp.R .*{words}"):
@@ -206,7 +206,7 @@ class Headers(unittest.TestCase):
     def test_the_command_prints_one_line(self) -> None:
         del self.meta["normalizer"]
         self.write()
-        command = [sys.executable, "-m", "demc", str(self.path)]
+        command = [sys.executable, "-m", "demc.torch", str(self.path)]
         environment = os.environ | {"PYTHONPATH": str(PACKAGE)}
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         self.assertEqual(done.returncode, 1)

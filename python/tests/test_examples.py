@@ -59,7 +59,7 @@ class Examples(unittest.TestCase):
 
     def test_both_give_the_image_and_the_channels_of_demc_infer(self) -> None:
         import numpy as np
-        from demc.exr import ExrFile
+        from demc.torch.exr import ExrFile
 
         expected = self.folder / "rust.exr"
         for source in FILES:
@@ -82,14 +82,14 @@ class Examples(unittest.TestCase):
 
     def kernel_model(self) -> Path:
         """A random network whose kernels differ from pixel to pixel, with the albedo filter of the bundled model."""
-        import demc
+        import demc.torch
         import torch
         from safetensors.torch import save_file
 
-        bundle = demc.load(self.models["torch"])
+        bundle = demc.torch.load(self.models["torch"])
         torch.manual_seed(4)
-        config = demc.ModelConfig(width=4, head="kernel")
-        bundle.model = demc.Denoiser(config)
+        config = demc.torch.ModelConfig(width=4, head="kernel")
+        bundle.model = demc.torch.Denoiser(config)
         with torch.no_grad():
             for weight in bundle.model.decoder.kernels.parameters():
                 weight.uniform_(-1, 1)
@@ -99,7 +99,7 @@ class Examples(unittest.TestCase):
 
     def test_layers_are_those_of_demc_infer(self) -> None:
         import numpy as np
-        from demc.exr import ExrFile
+        from demc.torch.exr import ExrFile
 
         model, expected, found = self.kernel_model(), self.folder / "rust.exr", self.folder / "torch.exr"
         layers = "--layers", "*.A", "--layers", "*Depth*"

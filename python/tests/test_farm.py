@@ -24,8 +24,8 @@ MISSING = [name for name in ("openjd", "demc-infer") if shutil.which(name) is No
 
 sys.path.insert(0, str(PACKAGE))
 
-from demc.files import ABANDONED, replacing, write_text
-from demc.shard import Shard, add_shard_flag
+from demc.torch.files import ABANDONED, replacing, write_text
+from demc.torch.shard import Shard, add_shard_flag
 
 
 def write_often(path: Path, letter: str) -> None:

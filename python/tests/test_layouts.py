@@ -1,4 +1,4 @@
-"""Tests of `demc.read_exr`: run `python -m unittest discover -s tests` in `python/`."""
+"""Tests of `demc.torch.read_exr`: run `python -m unittest discover -s tests` in `python/`."""
 
 import importlib.util
 import subprocess
@@ -13,11 +13,11 @@ RENDERERS = ROOT / "tests" / "renderers" / "files"
 MISSING = [name for name in ["numpy", "OpenEXR"] if importlib.util.find_spec(name) is None]
 
 if not MISSING:
-    import demc
+    import demc.torch
     import numpy as np
     import OpenEXR
-    from demc import layouts
-    from demc.exr import ExrFile
+    from demc.torch import layouts
+    from demc.torch.exr import ExrFile
 
 MITSUBA = ["R", "G", "B", *(f"normal.{x}" for x in "XYZ"), *(f"position.{x}" for x in "XYZ"), *(f"albedo.{x}" for x in "RGB")]
 """Channels of the layout mitsuba3."""
@@ -47,14 +47,14 @@ class Files(unittest.TestCase):
 
     def refused(self, message: str, *arguments: object, **named: object) -> None:
         with self.assertRaises(ValueError) as caught:
-            demc.read_exr(self.path, *arguments, **named)
+            demc.torch.read_exr(self.path, *arguments, **named)
         self.assertIn(message, str(caught.exception))
         self.assertNotIn("\n", str(caught.exception))
 
 
 class Detection(Files):
     def test_both_forms_of_cycles_files_have_the_same_buffers(self) -> None:
-        one, several = (demc.read_exr(RENDERERS / f"cycles-{version}.exr") for version in ("4.5", "5.0"))
+        one, several = (demc.torch.read_exr(RENDERERS / f"cycles-{version}.exr") for version in ("4.5", "5.0"))
         self.assertEqual((len(one.file.parts), len(several.file.parts)), (1, 6))
         for frame in (one, several):
             names = frame.layout.name, frame.layout.layer
@@ -68,7 +68,7 @@ class Detection(Files):
     def test_the_choice_names_what_replaces_missing_buffers(self) -> None:
         self.write(self.planes(name for name in MITSUBA if not name.startswith("position")))
         text = "layout mitsuba3; no position: zeros replace it; no texture2: texture1 replaces it"
-        frame = demc.read_exr(self.path)
+        frame = demc.torch.read_exr(self.path)
         self.assertEqual(frame.layout.describe(), text)
         self.assertEqual(np.abs(frame.features[3:6]).max(), 0)
         np.testing.assert_array_equal(frame.features[6:9], frame.features[9:])
@@ -77,7 +77,7 @@ class Detection(Files):
         names = [f"{layer}.{name}" for layer in ("Glass", "Wood") for name in CYCLES]
         self.write(self.planes(names))
         for preset in (None, "cycles"):
-            frame = demc.read_exr(self.path, preset, "Wood")
+            frame = demc.torch.read_exr(self.path, preset, "Wood")
             self.assertEqual(frame.layout.channels["color"][2], "Wood.Combined.B")
             self.refused('no view layer "Iron"; there is Glass, Wood', preset, "Iron")
         self.refused("view layers Glass, Wood: choose one", "cycles")
@@ -88,13 +88,13 @@ class Detection(Files):
         # The second layer has no position.
         names = [f"Glass.{name}" for name in CYCLES] + [f"Wood.{name}" for name in CYCLES if "Position" not in name]
         self.write(self.planes(names))
-        self.assertEqual(demc.read_exr(self.path).layout.layer, "Glass")
+        self.assertEqual(demc.torch.read_exr(self.path).layout.layer, "Glass")
 
     def test_presets_that_fit_equally_well_are_named(self) -> None:
         pbrt = [f"{buffer}.{x}" for buffer in ("Ns", "P") for x in "XYZ"] + [f"Albedo.{x}" for x in "RGB"]
         self.write(self.planes(MITSUBA + pbrt))
         self.refused("several presets fit equally well: mitsuba3, pbrt-v4; choose one")
-        self.assertEqual(demc.read_exr(self.path, "pbrt-v4").layout.channels["normal"][0], "Ns.X")
+        self.assertEqual(demc.torch.read_exr(self.path, "pbrt-v4").layout.channels["normal"][0], "Ns.X")
 
     def test_the_nearest_preset_is_named_with_what_it_lacks(self) -> None:
         self.write(self.planes(name for name in MITSUBA if name != "normal.Y"))
@@ -107,11 +107,11 @@ class Detection(Files):
         own = {"color": ["a", "b", "c"], "missing": {"normal": "zeros", "texture1": "zeros", "texture2": "zeros"}}
         own["missing"]["position"] = "zeros"
         self.write(self.planes(["a", "b", "c", *MITSUBA]))
-        self.assertEqual(demc.read_exr(self.path, bundle={"layout": own}).layout.channels["color"], ("a", "b", "c"))
+        self.assertEqual(demc.torch.read_exr(self.path, bundle={"layout": own}).layout.channels["color"], ("a", "b", "c"))
         # Its policies also hold for presets.
         self.write(self.planes("RGB") | self.planes(["albedo.R", "albedo.G", "albedo.B"]))
         self.refused("lacks normal.X")
-        self.assertEqual(demc.read_exr(self.path, bundle={"layout": own}).layout.name, "mitsuba3")
+        self.assertEqual(demc.torch.read_exr(self.path, bundle={"layout": own}).layout.name, "mitsuba3")
 
 
 class Buffers(Files):
@@ -120,7 +120,7 @@ class Buffers(Files):
         for axis, value in zip("XYZ", (np.inf, -np.inf, np.inf)):
             planes[f"position.{axis}"][1, 2] = value
         self.write(planes)
-        features = demc.read_exr(self.path).features
+        features = demc.torch.read_exr(self.path).features
         np.testing.assert_array_equal(features[3:6, 1, 2], 0)
         self.assertGreater(features[3:6, 1, 3].min(), 0)
         planes["position.Y"][1, 2] = 1
@@ -131,23 +131,23 @@ class Buffers(Files):
         planes = self.planes(MITSUBA)
         planes["G"][3, 0] = -1
         self.write(planes)
-        self.assertEqual(demc.read_exr(self.path).color[1, 3, 0], 0)
+        self.assertEqual(demc.torch.read_exr(self.path).color[1, 3, 0], 0)
         planes["albedo.B"][2, 4] = np.nan
         self.write(planes)
         self.refused("channel albedo.B: nan at x 4, y 2 (1 NaN or infinite samples in all)")
 
     def test_a_reference_is_read_if_present(self) -> None:
         self.write(self.planes([*MITSUBA, "ref.R", "ref.G", "ref.B"]))
-        self.assertEqual(demc.read_exr(self.path).reference.shape, (3, 4, 5))
+        self.assertEqual(demc.torch.read_exr(self.path).reference.shape, (3, 4, 5))
         # Denoising does not need it.
         self.write(self.planes([*MITSUBA, "ref.R"]))
         with self.assertRaisesRegex(ValueError, "no channel ref.G, ref.B; the file has"):
-            demc.read_exr(self.path).reference
+            demc.torch.read_exr(self.path).reference
         planes = self.planes([*MITSUBA, "ref.R", "ref.G", "ref.B"])
         planes["ref.G"][0, 1] = np.inf
         self.write(planes)
         with self.assertRaisesRegex(ValueError, "channel ref.G: inf at x 1, y 0"):
-            demc.read_exr(self.path).reference
+            demc.torch.read_exr(self.path).reference
 
     def test_parts_of_different_sizes_are_refused(self) -> None:
         layout = self.folder / "parts.toml"
@@ -156,11 +156,11 @@ class Buffers(Files):
         self.write(self.planes("RGB"), self.planes("XYZ", (4, 6)), self.planes("RGB"), displayWindow=display)
         self.refused("buffers of different sizes: a.R is 5x4, b.X is 6x4", str(layout))
         self.write(self.planes("RGB"), self.planes("XYZ"), self.planes("RGB"))
-        np.testing.assert_array_equal(demc.read_exr(self.path, str(layout)).features[0], self.planes("XYZ")["X"])
+        np.testing.assert_array_equal(demc.torch.read_exr(self.path, str(layout)).features[0], self.planes("XYZ")["X"])
 
     def test_damaged_files_are_one_sentence(self) -> None:
         with self.assertRaises(FileNotFoundError):
-            demc.read_exr(self.path)
+            demc.torch.read_exr(self.path)
         self.path.write_bytes(b"no image")
         self.refused("not a readable OpenEXR file")
         whole = (RENDERERS / "cycles-5.0.exr").read_bytes()
@@ -185,13 +185,13 @@ class Buffers(Files):
             layout.write_text(text)
             self.refused(message, str(layout))
         layout.write_text(good)
-        self.assertEqual(demc.read_exr(self.path, str(layout)).features.max(), 0)
+        self.assertEqual(demc.torch.read_exr(self.path, str(layout)).features.max(), 0)
 
 
 class Writing(Files):
     def copy(self, precision: str | None = None) -> tuple["ExrFile", "ExrFile"]:
         """The file at `path`, and its copy with colour 0.5."""
-        frame = demc.read_exr(self.path)
+        frame = demc.torch.read_exr(self.path)
         frame.write(self.folder / "y.exr", np.full_like(frame.color, 0.5), precision)
         self.assertEqual(sorted(p.name for p in self.folder.glob("*.exr")), ["x.exr", "y.exr"])
         self.assertFalse(list(self.folder.glob(".*")))
@@ -234,7 +234,7 @@ class Writing(Files):
 
     def test_layers_are_chosen_by_patterns_and_written(self) -> None:
         self.write(self.planes(MITSUBA) | self.planes(["lamp.R", "lamp.G", "fog.A"], kind="f2") | self.planes(["id"], kind="u4"))
-        frame = demc.read_exr(self.path)
+        frame = demc.torch.read_exr(self.path)
         layers = frame.layers("lamp.*", "[RGB]", "*.A")
         self.assertEqual(sorted(layers), ["fog.A", "lamp.G", "lamp.R"])
         self.assertEqual(layers["fog.A"].dtype, np.float32)
@@ -261,13 +261,13 @@ class Writing(Files):
 
     def test_large_values_stay_finite_in_half_precision(self) -> None:
         self.write(self.planes(MITSUBA, kind="f2"))
-        frame = demc.read_exr(self.path)
+        frame = demc.torch.read_exr(self.path)
         frame.write(self.path, np.full_like(frame.color, 1e6))
-        self.assertEqual(demc.read_exr(self.path).color.max(), 65504)
+        self.assertEqual(demc.torch.read_exr(self.path).color.max(), 65504)
 
     def test_another_size_or_folder_is_refused(self) -> None:
         self.write(self.planes(MITSUBA))
-        frame = demc.read_exr(self.path)
+        frame = demc.torch.read_exr(self.path)
         with self.assertRaisesRegex(ValueError, r"image is \[3, 4, 4\]: expected \[3, 4, 5\]"):
             frame.write(self.path, frame.color[:, :, :4])
         with self.assertRaisesRegex(ValueError, "precision 'double': expected half or float"):
@@ -282,32 +282,32 @@ class Preprocessing(Files):
     def test_the_package_reads_and_prepares_without_pytorch(self) -> None:
         script = (
             "import sys; sys.modules['torch'] = None\n"
-            "import demc\n"
-            f"frame = demc.read_exr({str(RENDERERS / 'mitsuba-3.9.exr')!r})\n"
+            "import demc.torch\n"
+            f"frame = demc.torch.read_exr({str(RENDERERS / 'mitsuba-3.9.exr')!r})\n"
             "meta = {'normalizer': {'position': 'image'}}\n"
-            "print(demc.preprocess.prepare(frame.color, frame.features, meta).features.shape)\n"
-            "try: demc.load\n"
+            "print(demc.torch.preprocess.prepare(frame.color, frame.features, meta).features.shape)\n"
+            "try: demc.torch.load\n"
             "except ImportError as error: print('no', error.name)\n"
         )
         done = subprocess.run([sys.executable, "-c", script], cwd=PACKAGE, capture_output=True, text=True)
         self.assertEqual(done.stdout, "(12, 64, 64)\nno torch\n", done.stderr)
 
     def test_exposures_outside_the_range_move_to_its_middle(self) -> None:
-        scale = lambda level: demc.preprocess.input_scale(np.full((3, 4, 4), level), self.META)
+        scale = lambda level: demc.torch.preprocess.input_scale(np.full((3, 4, 4), level), self.META)
         self.assertEqual([scale(level) for level in (0, 0.06, 0.2, 0.7)], [1] * 4)
         self.assertAlmostEqual(scale(2), 0.1, places=6)
         self.assertAlmostEqual(scale(0.002), 100, places=3)
 
     def test_with_an_exposure_level_every_image_is_scaled(self) -> None:
         meta = self.META | {"normalizer": {"exposure_level": 0.3}}
-        scale = lambda level: demc.preprocess.input_scale(np.full((3, 4, 4), level), meta)
+        scale = lambda level: demc.torch.preprocess.input_scale(np.full((3, 4, 4), level), meta)
         for level in (0.05, 0.2, 3):
             self.assertAlmostEqual(scale(level) * level / 0.3, 1, places=5)
         self.assertEqual([scale(0), scale(1e-12), scale(1e12)], [1, 1e6, float(np.float32(1e-6))])
 
     def test_edges_are_repeated_to_multiples_of_32(self) -> None:
         image = np.random.default_rng(3).random((3, 33, 32))
-        padded = demc.preprocess.pad(image)
+        padded = demc.torch.preprocess.pad(image)
         self.assertEqual(padded.shape, (3, 64, 32))
         np.testing.assert_array_equal(padded[:, 60], image[:, 32])
 

@@ -1,4 +1,4 @@
-"""Tests of `demc.light`. `tests/tests/python_live.rs` compares it with `demc-infer`."""
+"""Tests of `demc.torch.light`. `tests/tests/python_live.rs` compares it with `demc-infer`."""
 
 import importlib.util
 import unittest
@@ -6,7 +6,7 @@ import unittest
 MISSING = importlib.util.find_spec("numpy") is None
 if not MISSING:
     import numpy as np
-    from demc import light
+    from demc.torch import light
 
 META = {"normalizer": {"restore_light": True}}
 

@@ -26,8 +26,8 @@ from pathlib import Path
 
 import numpy as np
 from dataset import add_layout_flags, albedo, normal, pixels, reference, scenes, write
-from demc.exr import Frame, as_kind, read_exr
-from demc.layouts import BUFFERS
+from demc.torch.exr import Frame, as_kind, read_exr
+from demc.torch.layouts import BUFFERS
 from oidn import with_prefilter
 
 LOG_SCALE = 16

@@ -13,8 +13,8 @@ import OpenEXR
 # The package of this checkout: its reader needs neither an installation nor PyTorch.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from demc.exr import Frame, write_whole
-from demc.files import write_json
+from demc.torch.exr import Frame, write_whole
+from demc.torch.files import write_json
 
 
 def add_layout_flags(parser: argparse.ArgumentParser) -> None:

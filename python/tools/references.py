@@ -28,8 +28,8 @@ from pathlib import Path
 
 import numpy as np
 from dataset import add_layout_flags, albedo, manifest, normal, pixels, reference, write_manifest
-from demc.exr import Frame, read_exr
-from demc.shard import add_shard_flag
+from demc.torch.exr import Frame, read_exr
+from demc.torch.shard import add_shard_flag
 from oidn import with_prefilter
 
 LIGHTER = 3.0

@@ -91,6 +91,21 @@ class Extension(unittest.TestCase):
             if not name.startswith("ViewLayer.Combined.") or name.endswith(".A"):
                 self.assertTrue((plane == after[name]).all(), name)
 
+    @unittest.skipUnless(os.environ.get("DEMC_REQUIRE_WHEEL") == "1", "the wheel is not required")
+    def test_the_wheel_denoises_in_blenders_process(self):
+        import demc
+        from compare import image_of, rel_mse
+
+        noisy, denoised = files("wheel-noisy.exr"), files("wheel.exr")
+        self.render(noisy, 4, 3)
+        demc.denoise_exr(noisy, denoised)
+        self.assert_nearer(denoised, noisy)
+        frame = demc.torch.read_exr(noisy)
+        features = dict(zip(("normal", "position", "albedo"), frame.features.reshape(4, *frame.color.shape)))
+        image = demc.denoise(frame.color, **features)
+        reference, before = (image_of("cycles", Path(path)) for path in (files("reference.exr"), noisy))
+        self.assertLess(rel_mse(image.transpose(1, 2, 0), reference), 0.7 * rel_mse(before, reference))
+
     def test_passes_of_a_new_scene_are_set(self):
         layer, image = self.scene.view_layers[0], self.scene.render.image_settings
         self.assertTrue(layer.use_pass_normal and layer.use_pass_position and layer.cycles.denoising_store_passes)

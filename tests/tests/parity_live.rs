@@ -1,7 +1,7 @@
 //! Parity with an installed PyTorch: random weights are exported, loaded by `python/` with
 //! `strict=True`, and run.
 //!
-//! Needs a Python with the package of `python/` (`pip install ./python`), named by `DEMC_PYTHON`
+//! Needs a Python with the package of `python/` (`pip install './python[torch]'`), named by `DEMC_PYTHON`
 //! (default `python3`). Without it, the test reports that it is skipped; with
 //! `DEMC_REQUIRE_TORCH=1` it fails.
 
@@ -34,7 +34,8 @@ const OUTPUT: Tolerance = Tolerance {
 
 #[test]
 fn pytorch_loads_every_export_strictly_and_agrees() {
-    let Some(python) = Python::with("torch, demc", "./python", "DEMC_REQUIRE_TORCH") else {
+    let Some(python) = Python::with("torch, demc", "'./python[torch]'", "DEMC_REQUIRE_TORCH")
+    else {
         return;
     };
     for variant in Variant::ALL {
@@ -80,7 +81,13 @@ fn agrees(python: &Python, variant: Variant, reading: Reading, names: Names, pre
 
     let text = |path: &PathBuf| path.to_str().expect("a path in UTF-8").to_string();
     let run = python
-        .run(["-m", "demc", &text(&bundle), &text(&input), &text(&output)])
+        .run([
+            "-m",
+            "demc.torch",
+            &text(&bundle),
+            &text(&input),
+            &text(&output),
+        ])
         .expect("it ran before");
     assert!(
         run.status.success(),

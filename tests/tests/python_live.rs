@@ -1,7 +1,7 @@
 //! Use of exported files in Python: `export --verify`, weights trained in PyTorch and imported
 //! again, and the programs in `python/examples`.
 //!
-//! Needs a Python (`DEMC_PYTHON`, default `python3`) with `pip install onnxruntime ./python`. Without it, the tests report that they are skipped; with `DEMC_REQUIRE_ONNX=1` or
+//! Needs a Python (`DEMC_PYTHON`, default `python3`) with `pip install onnxruntime './python[torch]'`. Without it, the tests report that they are skipped; with `DEMC_REQUIRE_ONNX=1` or
 //! `DEMC_REQUIRE_TORCH=1` they fail.
 
 mod live;
@@ -36,12 +36,16 @@ const TOLERANCE: Tolerance = Tolerance {
 
 fn onnx() -> Option<Python> {
     let packages = "numpy, onnxruntime, OpenEXR, demc";
-    Python::with(packages, "onnxruntime ./python", "DEMC_REQUIRE_ONNX")
+    Python::with(
+        packages,
+        "onnxruntime './python[torch]'",
+        "DEMC_REQUIRE_ONNX",
+    )
 }
 
 fn torch() -> Option<Python> {
     let packages = "torch, demc, OpenEXR";
-    Python::with(packages, "./python", "DEMC_REQUIRE_TORCH")
+    Python::with(packages, "'./python[torch]'", "DEMC_REQUIRE_TORCH")
 }
 
 fn repository() -> PathBuf {

@@ -5,22 +5,22 @@ COLOR, FEATURES and OUTPUT are raw float32 of a square image; OUTPUT is the resu
 
 import sys
 
-import demc
+import demc.torch
 import numpy as np
 import torch
 from safetensors.torch import save_file
 
 path, color, features, side, weights, output = sys.argv[1:]
 color, features = (np.fromfile(name, "<f4").reshape(-1, int(side), int(side)) for name in (color, features))
-bundle = demc.load(path)
+bundle = demc.torch.load(path)
 before = {name: weight.clone() for name, weight in bundle.model.state_dict().items()}
 
 model = bundle.model.train()
 adam = torch.optim.Adam(model.parameters(), lr=1e-2)
 hdr, raw = (torch.from_numpy(image)[None] for image in (color, features))
 modulation = bundle.modulation(raw)
-out = model(demc.gamma_from_hdr(hdr, bundle.gamma) / modulation, bundle.features_z_from_raw(raw)) * modulation
-demc.rel_mse(demc.hdr_from_gamma(out, bundle.gamma), torch.full_like(hdr, 0.2)).backward()
+out = model(demc.torch.gamma_from_hdr(hdr, bundle.gamma) / modulation, bundle.features_z_from_raw(raw)) * modulation
+demc.torch.rel_mse(demc.torch.hdr_from_gamma(out, bundle.gamma), torch.full_like(hdr, 0.2)).backward()
 adam.step()
 model.eval()
 

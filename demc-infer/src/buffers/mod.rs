@@ -68,7 +68,7 @@ pub enum BufferError {
         expected: [usize; 2],
     },
     /// The image is empty or too large.
-    #[error(transparent)]
+    #[error("color: {0}")]
     Limit(UnsupportedSize),
     /// A buffer is absent, and the model has no replacement for it.
     #[error("no {buffer}, which this model needs")]

@@ -63,6 +63,14 @@ pub fn command() -> clap::Command {
     Arguments::command()
 }
 
+/// Runs a command for a program that reports the error itself: name and arguments as in [`main`].
+///
+/// # Errors
+/// As the command; an invalid command line.
+pub fn run_command(arguments: impl IntoIterator<Item = OsString>) -> anyhow::Result<()> {
+    run(Arguments::try_parse_from(arguments)?)
+}
+
 /// Runs the program with its name and arguments. Returns the exit code.
 pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     let arguments = match Arguments::try_parse_from(arguments) {

@@ -47,7 +47,7 @@ impl Runtime {
     fn name_and_packages(self) -> [&'static str; 2] {
         match self {
             Runtime::OnnxRuntime => ["onnx", "numpy onnxruntime"],
-            Runtime::PyTorch => ["torch", "./python"],
+            Runtime::PyTorch => ["torch", "'./python[torch]'"],
         }
     }
 }

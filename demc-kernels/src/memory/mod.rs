@@ -267,6 +267,12 @@ pub fn buffer(len: usize) -> Vec<f32> {
     unsafe { recycled(len) }.unwrap_or_else(|| vec![0.0; len])
 }
 
+/// Returns all free memory to the system. A library calls it when its work is done, because other
+/// parts of the process may need the memory.
+pub fn return_kept() {
+    std::iter::from_fn(|| kept().any()).for_each(|block| give_back(Some(block)));
+}
+
 /// Bytes of free memory that is kept for later large blocks.
 pub fn kept_bytes() -> usize {
     kept().bytes

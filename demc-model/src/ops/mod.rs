@@ -24,7 +24,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use burn::tensor::{Device, Tensor};
 pub use demc_kernels::Isa;
 pub use demc_kernels::isa::{UnknownIsa, VARIABLE as ISA_VARIABLE};
-pub use demc_kernels::memory::{Recycler, used as used_bytes};
+pub use demc_kernels::memory::{Recycler, return_kept, used as used_bytes};
 pub use demc_kernels::{start_threads, within_pool};
 use thiserror::Error;
 

@@ -16,14 +16,16 @@ pub struct StepProgress {
 }
 
 impl StepProgress {
-    /// A bar at step `first` of `steps`.
+    /// A bar at step `first` of `steps`. It is hidden in a process that prints nothing.
     pub fn new(first: u64, steps: u64, patches_per_step: u64, patches_per_epoch: usize) -> Self {
         let style =
             ProgressStyle::with_template("{bar:16} step {pos}/{len}  {eta} left  {wide_msg}")
                 .expect("a constant template");
-        let bar = ProgressBar::new(steps)
-            .with_style(style)
-            .with_position(first);
+        let bar = match message::is_silent() {
+            true => ProgressBar::hidden(),
+            false => ProgressBar::new(steps),
+        };
+        let bar = bar.with_style(style).with_position(first);
         bar.reset_eta();
         let steps_per_epoch = patches_per_epoch as f64 / patches_per_step as f64;
         StepProgress {

@@ -15,7 +15,7 @@ from . import load
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m demc", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m demc.torch", description=__doc__)
     parser.add_argument("bundle", help="file written by demc-infer export")
     parser.add_argument("input", nargs="?", help="safetensors file with color_gamma and features_z")
     parser.add_argument("output", nargs="?", help="safetensors file for the output")

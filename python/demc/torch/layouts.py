@@ -148,10 +148,13 @@ def resolve(name: str) -> Layout:
 @cache
 def preset(name: str) -> Layout:
     """One of PRESETS."""
-    here = Path(__file__).resolve()
-    # The package contains copies; a checkout of the repository has the originals only.
-    places = here.parent / "renderers", here.parents[2] / "configs" / "renderers"
-    return parse(name, next(place for place in places if place.is_dir()).joinpath(f"{name}.toml").read_bytes())
+    checkout = Path(__file__).resolve().parents[3] / "configs" / "renderers" / f"{name}.toml"
+    if checkout.is_file():
+        return parse(name, checkout.read_bytes())
+    # In an installed package, the native module has their texts.
+    from .._native import presets
+
+    return parse(name, dict(presets())[name].encode())
 
 
 def parse(name: str, text: bytes) -> Layout:

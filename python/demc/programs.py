@@ -1,0 +1,71 @@
+"""The command-line programs `demc-infer`, `demc-data`, and `demc-train`, and `demc.denoise_exr`."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+
+from . import _native
+
+
+def denoise_exr(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    model: str | os.PathLike[str] | None = None,
+    layout: str | os.PathLike[str] | None = None,
+    layers: Sequence[str] = (),
+    repair: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Denoises an OpenEXR file, as `demc-infer denoise` does.
+
+    The result is the source with other colour: parts, windows, attributes, and other channels stay.
+    Channels may have the names that Mitsuba, pbrt, Blender Cycles, LuxCore, or FBKSD write. Warnings
+    and notes appear on standard error.
+
+    Arguments:
+        source: noisy image with feature channels.
+        target: file to write.
+        model: run directory, checkpoint, or exported file; by default the bundled model.
+        layout: preset or TOML file of the channels; by default the one that fits.
+        layers: names or glob patterns of further channels to denoise. Needs a kernel head.
+        repair: whether NaN, infinite, and negative samples are replaced by the median around them.
+        overwrite: whether an existing target is replaced.
+
+    Raises:
+        DemcError: an image or a model that cannot be used; an existing target.
+        OSError: a file that cannot be read or written.
+        KeyboardInterrupt: after Ctrl-C, when the image is done.
+    """
+    arguments: list[str | os.PathLike[str]] = ["demc-infer", "denoise"]
+    for flag, value in (("--model", model), ("--layout", layout)):
+        if value is not None:
+            arguments += [flag, value]
+    for pattern in layers:
+        arguments += ["--layers", pattern]
+    arguments += [flag for flag, wanted in (("--repair", repair), ("--overwrite", overwrite)) if wanted]
+    _native.run_infer([os.fspath(argument) for argument in [*arguments, "--output", target, "--", source]])
+
+
+def infer() -> None:
+    """Runs `demc-infer` with the arguments of this process, and exits."""
+    _run(_native.infer)
+
+
+def data() -> None:
+    """Runs `demc-data` with the arguments of this process, and exits."""
+    _run(_native.data)
+
+
+def train() -> None:
+    """Runs `demc-train` with the arguments of this process, and exits."""
+    _run(_native.train_program)
+
+
+def _run(program: Callable[[list[str]], int]) -> None:
+    # Python's handler would wait for the end of the program.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    sys.exit(program(sys.argv))
