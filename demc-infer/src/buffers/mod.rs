@@ -2,8 +2,8 @@
 //!
 //! A [`View`] is an image of half or float samples whose channels, rows, and columns lie at any
 //! distance from each other. It may be planar or interleaved, flipped, or a part of a larger image.
-//! [`Buffers`] are the views of a frame, and [`Bundle::frame`](crate::Bundle::frame)
-//! copies them into a [`Frame`](demc_data::Frame), with the checks that a file's channels get. A [`ViewMut`] takes the
+//! [`Buffers`] are the views of a frame. [`Bundle::frame`](crate::Bundle::frame) copies them into a
+//! [`Frame`](demc_data::Frame), with the checks that a file's channels get. A [`ViewMut`] takes the
 //! result.
 //!
 //! ```

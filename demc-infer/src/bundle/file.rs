@@ -47,7 +47,21 @@ pub struct BundleFile {
     pub albedo_filter: Option<Box<BundleFile>>,
 }
 
+/// The bundled model, described in `models/README.md`.
+const BUNDLED: &[u8] = include_bytes!("../../../models/demc.safetensors");
+
 impl BundleFile {
+    /// The bundled model's name in messages and in `demc-infer inspect`.
+    pub const BUNDLED: &str = "the bundled model";
+
+    /// The bundled model, which is inside the program.
+    ///
+    /// # Errors
+    /// A build with a damaged model.
+    pub fn bundled() -> Result<Self, BundleError> {
+        Self::parse(Self::BUNDLED.into(), BUNDLED)
+    }
+
     /// Reads a run directory, a checkpoint directory or a bundle file; see [`super::Bundle::load`].
     ///
     /// # Errors

@@ -13,7 +13,6 @@
 //! A bundle may contain a second network, the albedo filter. Its tensors have the prefix
 //! `albedo_filter.`, and the header entry has its [`BundleMeta`] as `albedo_filter`.
 
-mod bundled;
 pub mod checksum;
 mod encode;
 mod error;

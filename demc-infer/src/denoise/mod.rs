@@ -9,7 +9,6 @@ mod layers;
 #[cfg(test)]
 mod layers_tests;
 mod light;
-mod progress;
 mod seams;
 #[cfg(test)]
 mod tests;
@@ -33,13 +32,34 @@ use layers::{check_layer_sizes, layer_images};
 pub use crate::error::{DenoiseError, LayersError};
 pub use demc_data::transform::MAX_INPUT_SCALE;
 pub use layers::Layer;
-pub use progress::{DenoiseObserver, DenoiseProgress, unobserved};
 pub use seams::SeamError;
 
 /// Exposures up to this factor outside the training scenes' range are not scaled: a stop, the
 /// exposure augmentation of training. On the data set's scenes, a stop within the range changed the
 /// error by up to 25 % in either direction.
 const TOLERANCE: f64 = 2.0;
+
+/// How far denoising an image has come.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct DenoiseProgress {
+    /// The tile that is computed, from 0.
+    pub tile: usize,
+    /// Number of tiles.
+    pub tiles: usize,
+    /// Finished share of the image, from 0 to 1. It stays at 0 in the pass of an albedo filter and
+    /// at 1 in that of alpha.
+    pub share: f64,
+}
+
+/// Receives the progress, and may stop the work. On the CPU it is called for every band of rows,
+/// elsewhere for every tile.
+pub type DenoiseObserver<'a> = dyn FnMut(DenoiseProgress) -> ControlFlow<()> + 'a;
+
+/// Lets the work finish.
+pub fn unobserved(_: DenoiseProgress) -> ControlFlow<()> {
+    ControlFlow::Continue(())
+}
 
 /// How a frame is denoised.
 #[derive(Debug, Clone, Default)]
