@@ -4,7 +4,7 @@ use std::ffi::{c_uint, c_void};
 use std::slice;
 
 use demc_data::exr::check_size;
-use demc_infer::buffers::{BufferError, Sample, View, ViewMut};
+use demc_infer::buffers::{BufferError, Sample, View, ViewMut, extent};
 
 use crate::error::Failure;
 
@@ -150,26 +150,15 @@ impl Image {
 
     /// Whether all bytes have addresses, and not more than a slice may have.
     fn is_addressable(&self, data: *mut c_void, offset: usize) -> bool {
-        let (low, high) = self.range();
+        let (low, high) = extent(self.sample, self.shape, self.strides);
         let first = data.addr() as i128 + offset as i128;
         let inside = first + low > 0 && first + high <= usize::MAX as i128;
         inside && high - low <= isize::MAX as i128
     }
 
-    /// The first byte and the end, in bytes from the first sample.
-    fn range(&self) -> (i128, i128) {
-        let (mut low, mut high) = (0, self.sample.bytes() as i128);
-        for (count, stride) in self.shape.iter().zip(self.strides) {
-            let far = (*count as i128 - 1) * stride as i128;
-            low += far.min(0);
-            high += far.max(0);
-        }
-        (low, high)
-    }
-
     /// The memory of all samples: start, length, and the byte of the first sample.
     fn memory(&self) -> (*mut u8, usize, usize) {
-        let (low, high) = self.range();
+        let (low, high) = extent(self.sample, self.shape, self.strides);
         let start = self.first.wrapping_offset(low as isize);
         (start, (high - low) as usize, -low as usize)
     }

@@ -2,7 +2,7 @@
 
 use std::slice;
 
-use demc_infer::buffers::{BufferError, Sample, View, ViewMut};
+use demc_infer::buffers::{BufferError, Sample, View, ViewMut, extent};
 use pyo3::buffer::PyUntypedBuffer;
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -38,7 +38,9 @@ impl Array {
         let (Ok(shape), Ok(strides), None) = (axes.0, axes.1, buffer.suboffsets()) else {
             return Err(PyValueError::new_err(format!("{name} must have 3 axes")));
         };
-        let (first, bytes) = extent(sample, shape, strides);
+        // A buffer is in memory, so its extent has the size of an address.
+        let (low, high) = extent(sample, shape, strides);
+        let (first, bytes) = (-low as usize, (high - low) as usize);
         Ok(Self {
             buffer,
             sample,
@@ -101,20 +103,4 @@ impl Array {
         let first = self.buffer.buf_ptr().cast::<u8>();
         first.wrapping_sub(self.first)
     }
-}
-
-/// Bytes before the first sample that belong to the array, and its size in bytes.
-fn extent(sample: Sample, shape: [usize; 3], strides: [isize; 3]) -> (usize, usize) {
-    if shape.contains(&0) {
-        return (0, 0);
-    }
-    let (mut before, mut after) = (0, 0);
-    for (count, stride) in shape.into_iter().zip(strides) {
-        let far = (count - 1) * stride.unsigned_abs();
-        match stride < 0 {
-            true => before += far,
-            false => after += far,
-        }
-    }
-    (before, before + after + sample.bytes())
 }

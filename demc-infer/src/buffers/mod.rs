@@ -31,7 +31,7 @@ mod tests;
 mod view;
 
 pub use frame::Buffers;
-pub use view::{Sample, View, ViewMut};
+pub use view::{Sample, View, ViewMut, extent};
 
 use demc_data::exr::UnsupportedSize;
 

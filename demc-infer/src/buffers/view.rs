@@ -24,6 +24,21 @@ impl Sample {
     }
 }
 
+/// The bytes of an image, counted from its first sample: the first one and the end. `shape` has channels,
+/// height, and width; `strides` are the bytes from one to the next. An image without samples has none.
+pub fn extent(sample: Sample, shape: [usize; 3], strides: [isize; 3]) -> (i128, i128) {
+    if shape.contains(&0) {
+        return (0, 0);
+    }
+    let (mut low, mut high) = (0, sample.bytes() as i128);
+    for (count, stride) in shape.into_iter().zip(strides) {
+        let far = (count as i128 - 1) * stride as i128;
+        low += far.min(0);
+        high += far.max(0);
+    }
+    (low, high)
+}
+
 /// Where the samples of an image lie.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Placement {
@@ -43,13 +58,9 @@ impl Placement {
         if shape.contains(&0) {
             return Ok(self);
         }
-        let (mut low, mut high) = (first as i128, first as i128);
-        for (count, stride) in shape.iter().zip(self.strides) {
-            let far = (*count as i128 - 1) * stride as i128;
-            low += far.min(0);
-            high += far.max(0);
-        }
-        match low >= 0 && high + self.sample.bytes() as i128 <= bytes as i128 {
+        let (low, high) = extent(self.sample, shape, self.strides);
+        let first = first as i128;
+        match first + low >= 0 && first + high <= bytes as i128 {
             true => Ok(self),
             false => Err(BufferError::Outside {
                 shape: Shape(shape),
