@@ -2,7 +2,7 @@
 """Compares models with Open Image Denoise (OIDN): the table of the model card.
 
     pip install numpy OpenEXR pyoidn
-    python3 benches/quality.py --data public=data/renders --data held-out=data/heldout --model quality=quality.safetensors
+    python3 benches/quality.py --data public=data/renders --data held-out=data/heldout
 
 Each row is one program on the test scenes of one data set with one number of samples per pixel. A ratio
 or difference compares with the better of OIDN (quality high) with albedo and normal, plain and denoised
@@ -20,6 +20,7 @@ import numpy as np
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 PEERS = ("oidn", "oidn-prefilter", "oidn-fast", "oidn-fast-prefilter")
 BEST_OF = PEERS[:2]
+BUNDLED = [(name, pathlib.Path(name)) for name in ("quality", "fast")]
 DRAWS = 10_000
 COLUMNS = {
     # Name: (value of a program from its scenes, whether the comparison is a ratio, whether less is better)
@@ -43,9 +44,9 @@ def run(*command: object) -> None:
     subprocess.run([str(part) for part in command], check=True, stdout=subprocess.DEVNULL)
 
 
-def scores_of(data: pathlib.Path, model: tuple[str, pathlib.Path] | None, work: pathlib.Path, program: str) -> dict:
+def scores_of(data: pathlib.Path, model: tuple[str, pathlib.Path], work: pathlib.Path, program: str) -> dict:
     """`{scene: {program: {metric: value}}}` of a model, the noisy image, and the peers."""
-    name, path = model or ("bundled", None)
+    name, path = model
     baselines = []
     for peer in PEERS:
         images = work / peer
@@ -54,8 +55,7 @@ def scores_of(data: pathlib.Path, model: tuple[str, pathlib.Path] | None, work: 
             (images / "complete").touch()
         baselines += ["--baseline", f"{peer}={images}"]
     report = work / f"{name}.json"
-    chosen = ["--model", path] if path else []
-    run(program, "evaluate", "--data", data, "--metrics", "flip,energy-bias", "--json", report, *chosen, *baselines)
+    run(program, "evaluate", "--model", path, "--data", data, "--metrics", "flip,energy-bias", "--json", report, *baselines)
     images = json.loads(report.read_text())["images"]
     return {image["name"]: {"noisy": image["noisy"], name: image["denoised"]} | image["baselines"] for image in images}
 
@@ -95,7 +95,7 @@ def table(scores: dict, scenes: list[str]) -> list[list[str]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", action="append", type=pair, required=True, metavar="NAME=DIR", help="data set with test scenes; can be repeated")
-    parser.add_argument("--model", action="append", type=pair, metavar="NAME=FILE", help="exported weights; can be repeated [the bundled model]")
+    parser.add_argument("--model", action="append", type=pair, metavar="NAME=FILE", help="exported weights; can be repeated [both bundled models]")
     parser.add_argument("--work", type=pathlib.Path, default=ROOT / "runs/compared", metavar="DIR", help="OIDN's images and the scores [runs/compared]")
     parser.add_argument("--program", default=str(ROOT / "target/release/demc-infer"), metavar="FILE", help="demc-infer [target/release/demc-infer]")
     args = parser.parse_args()
@@ -103,7 +103,7 @@ def main() -> None:
         scores: dict[str, dict] = {}
         work = args.work / data_name
         work.mkdir(parents=True, exist_ok=True)
-        for model in args.model or [None]:
+        for model in args.model or BUNDLED:
             for scene, programs in scores_of(data, model, work, args.program).items():
                 scores.setdefault(scene, {}).update(programs)
         for count, scenes in groups(data).items():

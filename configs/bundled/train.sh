@@ -1,8 +1,8 @@
 #!/bin/sh
-# Trains a model like the bundled one: renders the data, runs the 13 stages, trains the albedo filter,
-# exports the weights.
+# Trains models like the bundled ones: renders the data, runs the 13 stages of `quality`, trains the albedo
+# filter and then `fast`, exports the weights.
 #
-#   configs/bundled/train.sh [--base DIR]   8 hours of training and 3 hours of rendering on 2 cores
+#   configs/bundled/train.sh [--base DIR]   10 hours of training and 7 hours of rendering on 2 cores
 #   configs/bundled/train.sh --try          2 steps per stage on data/sample, about 1 minute
 #
 # --base is the data set that the rendered views are added to, by default data/renders. That set (89
@@ -10,10 +10,11 @@
 # repository root.
 #
 # Run it from any directory. It needs demc-train and demc-infer on the PATH. Rendering also needs
-# Python with mitsuba, bpy, pyluxcore, numpy, OpenEXR, pyoidn, and safetensors; PYTHON names the interpreter. Rerun the script to
+# Python with mitsuba, bpy, pyluxcore, numpy, OpenEXR, pyoidn, safetensors, and torch; PYTHON names the interpreter. Rerun the script to
 # resume it: complete data sets and stages are skipped.
 #
-# The result resembles models/demc.safetensors but has other weights:
+# The results resemble the bundled models but have other weights. `fast` was trained on the first 583 of the
+# about 1,550 views that its data set keeps. About `quality`:
 # - The original stages 1 to 8 filtered the references during training (data.reference_filter).
 #   Here references.py cleans them.
 # - The original runs set train.lr_fan_in = 96 and train.recycle = 1000. Both keys are removed.
@@ -122,28 +123,43 @@ if [ -n "$steps" ]; then
     rm -rf runs/bundled-try
     mkdir -p runs/bundled-try/data/bundled
     cd runs/bundled-try
-    for name in clean-a clean-b clean-c clean-d albedo; do
+    for name in clean-a clean-b clean-c clean-d clean-f albedo; do
         ln -s "$repository/data/sample" "data/bundled/$name"
     done
 else
     render_all
 fi
 
-for config in "$repository"/configs/bundled/*.toml; do
-    run=runs/bundled/$(basename "$config" .toml)
+# Trains one stage: train NAME
+train() {
+    run=runs/bundled/$1
     # The scores of the test split are the last file that a run writes.
-    [ -e "$run/test.json" ] && continue
+    [ ! -e "$run/test.json" ] || return 0
     echo "== $run"
-    set -- --config "$config"
+    set -- --config "$repository/configs/bundled/$1.toml"
     [ -z "$steps" ] || set -- "$@" --set "train.steps=$steps"
     [ ! -e "$run" ] || set -- "$@" --resume
     demc-train "$@"
+}
+
+for stage in 01 02 03 04 05 06 07 08 09 10 11 12 13 albedo; do
+    train $stage
 done
 
+# The data of `fast`: views with 1 to 256 samples per pixel, whose albedo is filtered as in denoising.
+filter=runs/bundled/albedo.safetensors
+demc-infer export --model runs/bundled/albedo -o $filter
+if [ -z "$steps" ]; then
+    "$python" python/render -o data/bundled/f --preset train --with "$base"
+    "$python" python/tools/references.py --data data/bundled/f -o data/bundled/clean-f --albedo-filter $filter
+fi
+train fast
+
 [ -z "$steps" ] || exit 0
-# The bundled model is 0.7 of stage 13 and 0.3 of stage 12.
+# `quality` is 0.7 of stage 13 and 0.3 of stage 12.
 for stage in 12 13; do
     demc-infer export --model "runs/bundled/$stage" -o "runs/bundled/$stage.safetensors"
 done
 "$python" configs/bundled/average.py runs/bundled/12.safetensors runs/bundled/13.safetensors 0.7 runs/bundled/mean.safetensors
-demc-infer export --model runs/bundled/mean.safetensors --albedo-filter runs/bundled/albedo --precision f16 -o runs/bundled/demc.safetensors
+demc-infer export --model runs/bundled/mean.safetensors --albedo-filter $filter --precision f16 -o runs/bundled/quality.safetensors
+demc-infer export --model runs/bundled/fast --albedo-filter $filter --precision f16 -o runs/bundled/fast.safetensors

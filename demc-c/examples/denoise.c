@@ -1,7 +1,7 @@
 // Renders a small frame, denoises it, and writes denoised.pfm.
 //
 //   cc denoise.c -o denoise $(pkg-config --cflags --libs demc) -lm
-//   ./denoise                      with the bundled model
+//   ./denoise                      with the bundled model "quality"
 //   ./denoise model.safetensors    with another model
 
 #include <demc.h>

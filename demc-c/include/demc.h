@@ -96,8 +96,8 @@ typedef struct DemcModelObject *DemcModel;
 
 // Reads a model.
 //
-// `path`, in UTF-8: an exported file (.safetensors), a run directory, or a checkpoint directory.
-// NULL is the bundled model, which is inside the library.
+// `path`, in UTF-8: an exported file (.safetensors), a run directory, a checkpoint directory, or the
+// name of a model that is inside the library: "quality" (smaller error) or "fast". NULL is "quality".
 //
 // Returns NULL on errors: DEMC_ERROR_INVALID_MODEL for a file that cannot be read, is damaged, is no
 // model, or has another format.
@@ -174,10 +174,10 @@ void demcReleaseFilter(DemcFilter filter);
 // "layer:NAME"       1 or 3    a further image to filter with the colour's kernels
 // "outputLayer:NAME" 1 or 3    that layer, filtered
 //
-// "color" and "output" are required, and the features as the model needs them. The bundled model
-// needs normal and albedo. Without position, it uses zeros; without albedo2, the albedo. Layers
-// need a model with a kernel head, which the bundled model is not. A layer of 3 channels is light,
-// and one of 1 channel is a mask.
+// "color" and "output" are required, and the features as the model needs them. The bundled models
+// need normal and albedo. Without position, they use zeros; without albedo2, the albedo. Layers
+// need a model with a kernel head, as the bundled ones are. A layer of 3 channels is light, and one
+// of 1 channel is a mask.
 //
 // `data` is the caller's memory. It must stay valid until the last execution with it has ended. An
 // output may be the same image as an input, because outputs are written last.

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::{ptr, slice};
 
-use demc_infer::{Bundle, BundleError, BundleFile};
+use demc_infer::{Bundle, BundleError, BundleFile, Bundled};
 
 use crate::device::{DemcDevice, Device};
 use crate::error::{Failure, guarded};
@@ -53,8 +53,9 @@ unsafe fn new_model(
 
 /// Reads a model.
 ///
-/// `path`, in UTF-8: an exported file (.safetensors), a run directory, or a checkpoint directory.
-/// NULL is the bundled model, which is inside the library.
+/// `path`, in UTF-8: an exported file (.safetensors), a run directory, a checkpoint directory, or the
+/// name of a model that is inside the library: "quality" (for 4 samples per pixel) or "fast" (for 1 to
+/// 256). NULL is "quality".
 ///
 /// Returns NULL on errors: DEMC_ERROR_INVALID_MODEL for a file that cannot be read, is damaged, is no
 /// model, or has another format.
@@ -62,7 +63,7 @@ unsafe fn new_model(
 pub unsafe extern "C" fn demcNewModel(device: DemcDevice, path: *const c_char) -> DemcModel {
     let make = |device: &Arc<Device>| {
         if path.is_null() {
-            return Model::new(device, BundleFile::bundled);
+            return Model::new(device, || BundleFile::bundled(Bundled::Quality));
         }
         // SAFETY: the caller passes a string.
         let path = unsafe { handle::text("path of the model", path)? };

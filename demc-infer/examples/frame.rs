@@ -21,8 +21,7 @@ const LAMP: Vec3 = [-0.5, 3.6, 0.9];
 const LAMP_RADIANCE: f32 = 60.0;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let model = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/demc.safetensors");
-    let bundle = Bundle::load(model.as_ref(), &device::parse("flex")?)?;
+    let bundle = Bundle::load("quality".as_ref(), &device::parse("flex")?)?;
     let frame = render();
     for warning in bundle.warnings(&frame)? {
         eprintln!("warning: {warning}");

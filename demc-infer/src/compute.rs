@@ -59,7 +59,7 @@ impl ComputeFlags {
 }
 
 /// Memory in bytes without which a program cannot read a model (ours: 250 MiB of address space suffice
-/// for the bundled one).
+/// for a bundled one).
 const LEAST_MEMORY: u64 = 128 << 20;
 
 /// Runs a program's `work` on one of its threads: as many as `RAYON_NUM_THREADS` asks for, at most

@@ -7,9 +7,9 @@
 //! use demc_data::Frame;
 //! use demc_infer::{Bundle, device};
 //!
-//! // A run directory, a checkpoint or an exported file.
+//! // A bundled model (quality or fast), a run directory, a checkpoint or an exported file.
 //! let device = device::parse("flex")?;
-//! let bundle = Bundle::load("../models/demc.safetensors".as_ref(), &device)?;
+//! let bundle = Bundle::load("quality".as_ref(), &device)?;
 //!
 //! let (width, height) = (64, 48);
 //! // Planar buffers as rendered. Colour is linear HDR.
@@ -70,7 +70,7 @@ pub mod tiles;
 pub mod verify;
 
 pub use baseline::{Baseline, BaselineError};
-pub use bundle::{Bundle, BundleError, BundleFile, BundleMeta, Names, Precision};
+pub use bundle::{Bundle, BundleError, BundleFile, BundleMeta, Bundled, Names, Precision};
 pub use denoise::{DenoiseError, Denoised};
 pub use device::DeviceError;
 pub use ensemble::Ensemble;

@@ -9,6 +9,7 @@ use common::{Outcome, demc_infer, random_bundle, run_directory, sample, sample_i
 use demc_data::exr::ExrFile;
 use demc_data::plane::Plane;
 use demc_data::read_frame;
+use demc_infer::Bundled;
 
 fn denoise(model: &Path, inputs: &[&Path], output: &Path) -> Outcome {
     let mut list = arguments!["denoise", "--model", model, "-o", output].to_vec();
@@ -167,29 +168,34 @@ fn channels_that_do_not_fit_the_layout_are_listed() {
 }
 
 #[test]
-fn the_bundled_model_denoises() {
+fn the_bundled_models_denoise() {
     let out = tempfile::tempdir().expect("directory");
     let layout = random_bundle().meta.layout;
-    for name in ["col-classroom-1.exr", "gen-room-test-1.exr"] {
-        let input = sample_image(name);
-        let output = out.path().join(name);
-        demc_infer(arguments!["denoise", input, "-o", output]).success();
-        let frame = read_frame(&input, &layout).expect("frame");
-        let reference = frame.reference.as_deref().expect("a reference");
-        let denoised: Vec<f32> = read_rgb(&output).iter().flat_map(Plane::to_f32).collect();
-        let error = |image: &[f32]| demc_model::metrics::rel_mse_image(image, reference);
-        let (noisy, black) = (error(&frame.color), error(&vec![0.0; reference.len()]));
-        let found = error(&denoised);
-        assert!(found < 0.15 * noisy.min(black), "{name}: {found}");
+    for model in Bundled::ALL.map(Bundled::name) {
+        for name in ["col-classroom-1.exr", "gen-room-test-1.exr"] {
+            let input = sample_image(name);
+            let output = out.path().join(format!("{model}-{name}"));
+            demc_infer(arguments!["denoise", "--model", model, input, "-o", output]).success();
+            let frame = read_frame(&input, &layout).expect("frame");
+            let reference = frame.reference.as_deref().expect("a reference");
+            let denoised: Vec<f32> = read_rgb(&output).iter().flat_map(Plane::to_f32).collect();
+            let error = |image: &[f32]| demc_model::metrics::rel_mse_image(image, reference);
+            let (noisy, black) = (error(&frame.color), error(&vec![0.0; reference.len()]));
+            let found = error(&denoised);
+            assert!(found < 0.15 * noisy.min(black), "{model}, {name}: {found}");
+        }
     }
     let shown = demc_infer(arguments!["inspect"]).success();
-    shown.says("the bundled model");
+    shown.says("quality");
 }
 
 #[test]
-fn the_bundled_model_is_small() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/demc.safetensors");
-    assert!(fs::metadata(path).expect("a model").len() <= 30_000_000);
+fn the_bundled_models_are_small() {
+    for model in Bundled::ALL {
+        let file = format!("../models/{}.safetensors", model.name());
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(file);
+        assert!(fs::metadata(path).expect("a model").len() <= 30_000_000);
+    }
 }
 
 #[test]

@@ -23,12 +23,12 @@ fn inputs(name: &str) -> Vec<(PathBuf, Vec<u8>)> {
         .collect()
 }
 
-/// Writes the header and the smallest tensors of the bundled model:
+/// Writes the header and the smallest tensors of a bundled model:
 /// `cargo test --release -p demc-infer --test fuzz_inputs -- --ignored`.
 #[test]
 #[ignore = "writes into fuzz/seeds"]
 fn write_seeds() {
-    let model = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/demc.safetensors");
+    let model = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/quality.safetensors");
     let bytes = fs::read(model).expect("it is in the repository");
     let (_, header) = SafeTensors::read_metadata(&bytes).expect("sound");
     let entry = header.metadata().as_ref().expect("a bundle")["demc"].clone();

@@ -98,8 +98,8 @@ fn the_layout_of_a_sequence_is_printed_once() {
 }
 
 fn bundle() -> Bundle {
-    let model = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/demc.safetensors");
-    Bundle::load(&model, &device::parse("flex").expect("the CPU")).expect("the model")
+    let device = device::parse("flex").expect("the CPU");
+    Bundle::load("quality".as_ref(), &device).expect("the model")
 }
 
 /// RelMSE of a stock file whose frame `change` has changed, relative to the unchanged file. `back` is

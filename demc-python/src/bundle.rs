@@ -41,16 +41,11 @@ type Options = (String, Option<f32>, Option<bool>, Option<u64>);
 
 #[pymethods]
 impl PyBundle {
-    /// Loads a run directory, a checkpoint directory, or a file; the bundled model without a path.
+    /// Loads a bundled model (`quality` or `fast`), a run directory, a checkpoint directory, or a file.
     #[new]
-    #[pyo3(signature = (path=None))]
-    fn new(py: Python<'_>, path: Option<PathBuf>) -> PyResult<Self> {
+    fn new(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
         let load = |_: Caller<()>| -> anyhow::Result<Bundle> {
-            let file = match &path {
-                Some(path) => BundleFile::read(path)?,
-                None => BundleFile::bundled()?,
-            };
-            Ok(file.into_bundle(&device::parse("flex")?)?)
+            Ok(BundleFile::read(&path)?.into_bundle(&device::parse("flex")?)?)
         };
         let bundle = work::run(py, load, work::UNHEARD)?;
         bundle.map(Self).map_err(exception)

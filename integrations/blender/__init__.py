@@ -29,7 +29,7 @@ class DemcPreferences(bpy.types.AddonPreferences):
         name="Program", description="Path of demc-infer. If empty, it is searched on the PATH", subtype="FILE_PATH"
     )
     model: StringProperty(
-        name="Model", description="Exported model or run directory. If empty, the bundled model is used", subtype="FILE_PATH"
+        name="Model", description="Bundled model (quality or fast), exported model, or run directory. If empty: quality", subtype="FILE_PATH"
     )
 
     def draw(self, context):

@@ -17,7 +17,7 @@ class Failure(Exception):
 class Job:
     """A running `demc-infer denoise`.
 
-    `program` and `model` may be empty: then the program is searched on the PATH and uses its bundled model. An empty
+    `program` and `model` may be empty: then the program is searched on the PATH and uses the model `quality`. An empty
     `layer` is right for files with one view layer.
     """
 

@@ -6,7 +6,7 @@
     demc.denoise_exr("noisy.exr", "clean.exr")
 
 Arrays are float32 or float16, (height, width, 3) or (3, height, width), with any strides. The
-bundled model is inside the package. `demc.torch` has the same networks in PyTorch; it needs
+bundled models are inside the package. `demc.torch` has the same networks in PyTorch; it needs
 `pip install demc[torch]`.
 
 Names are imported at first use, so `demc.torch` works without the native module.

@@ -14,8 +14,8 @@ class DemcError(ValueError):
 class Bundle:
     """A network ready to denoise on the CPU. All images are [channels, height, width]."""
 
-    def __init__(self, path: str | None) -> None:
-        """Loads a run directory, a checkpoint directory, or a file; the bundled model without a path."""
+    def __init__(self, path: str) -> None:
+        """Loads a bundled model (`quality` or `fast`), a run directory, a checkpoint directory, or a file."""
 
     def metadata(self) -> str:
         """Everything about the network except its weights, as JSON."""

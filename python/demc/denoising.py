@@ -19,7 +19,7 @@ from ._native import Bundle
 COLORS = "RGB"
 """The ends of the names of a layer's three channels."""
 _LOCK = threading.Lock()
-_BUNDLED: list[Model] = []
+_BUNDLED: dict[str, Model] = {}
 
 
 class DemcWarning(UserWarning):
@@ -55,29 +55,29 @@ class DenoiseOptions(TypedDict, total=False):
 class Model:
     """A network ready to denoise on the CPU. Several threads may use it at the same time."""
 
-    def __init__(self, path: str | os.PathLike[str] | None = None) -> None:
+    def __init__(self, path: str | os.PathLike[str] = "quality") -> None:
         """Loads a run directory of `train`, a checkpoint directory, or a file of `demc-infer export`.
 
-        Without a path, loads the bundled model. Raises OSError for a file that cannot be read and
-        DemcError for one that is damaged or has another format.
+        `quality` and `fast` are models inside the package; `./fast` is a file. Raises OSError for a
+        file that cannot be read and DemcError for one that is damaged or has another format.
         """
-        self._path = None if path is None else os.fspath(path)
+        self._path = os.fspath(path)
         self._bundle = Bundle(self._path)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str] | None = None) -> Model:
-        """Loads a model as `Model(path)` does. Without a path, the bundled model is read only once."""
-        if path is not None:
+    def load(cls, path: str | os.PathLike[str] = "quality") -> Model:
+        """Loads a model as `Model(path)` does. `quality` and `fast` are read only once."""
+        if path not in ("quality", "fast"):
             return cls(path)
         with _LOCK:
-            if not _BUNDLED:
-                _BUNDLED.append(cls())
-            return _BUNDLED[0]
+            if path not in _BUNDLED:
+                _BUNDLED[path] = cls(path)
+            return _BUNDLED[path]
 
     @property
     def name(self) -> str:
-        """Its path, or `the bundled model`."""
-        return self._path or "the bundled model"
+        """The path that it was loaded from."""
+        return self._path
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -136,7 +136,7 @@ def denoise(
     *,
     alpha: None = None,
     layers: None = None,
-    model: Model | str | os.PathLike[str] | None = None,
+    model: Model | str | os.PathLike[str] = "quality",
     **options: Unpack[DenoiseOptions],
 ) -> np.ndarray: ...
 
@@ -147,7 +147,7 @@ def denoise(
     *,
     alpha: ArrayLike | None = None,
     layers: Mapping[str, ArrayLike] | None = None,
-    model: Model | str | os.PathLike[str] | None = None,
+    model: Model | str | os.PathLike[str] = "quality",
     **options: Unpack[DenoiseOptions],
 ) -> Denoised: ...
 
@@ -161,7 +161,7 @@ def denoise(
     albedo2: ArrayLike | None = None,
     alpha: ArrayLike | None = None,
     layers: Mapping[str, ArrayLike] | None = None,
-    model: Model | str | os.PathLike[str] | None = None,
+    model: Model | str | os.PathLike[str] = "quality",
     out: np.ndarray | None = None,
     passes: int = 1,
     input_scale: float | None = None,
@@ -185,7 +185,7 @@ def denoise(
         layers: further channels by name, (height, width) or three channels, that the colour's
             kernels filter. Layers that add up to the colour still do. A plane whose name ends in
             `.R`, `.G`, or `.B` belongs to that channel of the colour. Needs `Model.takes_layers`.
-        model: a `Model`, or what `Model.load` takes; by default the bundled model.
+        model: a `Model`, or what `Model.load` takes.
         out: array for the result, with the shape of `color`; may be `color` itself.
         passes: mean of 1, 4, or 8 passes over flipped and transposed copies. Layers need 1.
         input_scale: factor on the colour before the network; by default `Model.input_scale(color)`.

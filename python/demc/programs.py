@@ -14,7 +14,7 @@ def denoise_exr(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
     *,
-    model: str | os.PathLike[str] | None = None,
+    model: str | os.PathLike[str] = "quality",
     layout: str | os.PathLike[str] | None = None,
     layers: Sequence[str] = (),
     repair: bool = False,
@@ -29,7 +29,7 @@ def denoise_exr(
     Arguments:
         source: noisy image with feature channels.
         target: file to write.
-        model: run directory, checkpoint, or exported file; by default the bundled model.
+        model: `quality`, `fast`, a run directory, a checkpoint, or an exported file.
         layout: preset or TOML file of the channels; by default the one that fits.
         layers: names or glob patterns of further channels to denoise. Needs a kernel head.
         repair: whether NaN, infinite, and negative samples are replaced by the median around them.
@@ -40,10 +40,9 @@ def denoise_exr(
         OSError: a file that cannot be read or written.
         KeyboardInterrupt: after Ctrl-C, when the image is done.
     """
-    arguments: list[str | os.PathLike[str]] = ["demc-infer", "denoise"]
-    for flag, value in (("--model", model), ("--layout", layout)):
-        if value is not None:
-            arguments += [flag, value]
+    arguments: list[str | os.PathLike[str]] = ["demc-infer", "denoise", "--model", model]
+    if layout is not None:
+        arguments += ["--layout", layout]
     for pattern in layers:
         arguments += ["--layers", pattern]
     arguments += [flag for flag, wanted in (("--repair", repair), ("--overwrite", overwrite)) if wanted]

@@ -49,7 +49,7 @@ class TrainResult(NamedTuple):
 def evaluate(
     data: str | os.PathLike[str],
     *,
-    model: Model | str | os.PathLike[str] | None = None,
+    model: Model | str | os.PathLike[str] = "quality",
     split: str = "test",
     layout: str | None = None,
     passes: int = 1,
@@ -59,7 +59,7 @@ def evaluate(
 
     Arguments:
         data: directory with `manifest.json`.
-        model: a `Model`, or what `Model.load` takes; by default the bundled model.
+        model: a `Model`, or what `Model.load` takes.
         split: `test` or `train`.
         layout: preset or TOML file of the files' channels; by default the one that fits.
         passes: mean of 1, 4, or 8 passes over flipped and transposed copies of each image.

@@ -46,7 +46,7 @@ NEAR, STILL_NEAR = 0.5, 0.15
 
 COUNTS = [1, 2, 4, 8, 16, 32, 64, 128, 256]
 PRESETS = {
-    "train": {"rooms": 680, "stills": 380, "size": 192, "spp": COUNTS, "counts": 1, "traits": 0.25, "seed": 29},
+    "train": {"rooms": 680, "stills": 380, "size": 192, "spp": COUNTS, "counts": 3, "traits": 0.25, "seed": 29},
     "heldout": {
         "rooms": 78, "stills": 20, "views": 1, "size": 256, "spp": COUNTS[::2], "ref_spp": 2048, "residual": 0.0,
         "reserved": True, "split": "test", "seed": 1029,
@@ -110,10 +110,17 @@ def main() -> None:
 
 
 def drawn_counts(args, rng: np.random.Generator) -> list[int]:
-    """The numbers of samples per pixel of a view's noisy images, in order. Small ones are drawn more often."""
+    """The numbers of samples per pixel of a view's noisy images, in order.
+
+    The largest one is drawn, small ones more often; the others are drawn from those below it, whose
+    samples are traced anyway.
+    """
+    if not args.counts:
+        return args.spp
     chances = 1 / np.sqrt(args.spp)
-    number = min(args.counts or len(args.spp), len(args.spp))
-    return sorted(int(count) for count in rng.choice(args.spp, number, replace=False, p=chances / chances.sum()))
+    largest = int(rng.choice(len(args.spp), p=chances / chances.sum()))
+    others = rng.choice(args.spp[:largest], min(args.counts - 1, largest), replace=False) if largest else []
+    return sorted([*map(int, others), args.spp[largest]])
 
 
 def own_scenes(args, budget: views.Budget) -> Iterator[Base]:
@@ -207,7 +214,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--black", type=float, default=0.2, metavar="SHARE", help="share of the rooms with black bars and blinds [0.2]")
     parser.add_argument("--studio", type=float, default=0.15, metavar="SHARE", help="share of the still lifes in a black studio [0.15]")
     parser.add_argument("--spp", type=numbers, default=[4], metavar="N,...", help="samples per pixel of the noisy images [4]")
-    parser.add_argument("--counts", type=int, metavar="N", help="number of noisy images per view, drawn from --spp, small ones more often [all]")
+    parser.add_argument("--counts", type=int, metavar="N", help="largest number of noisy images per view, drawn from --spp, small ones more often [all]")
     parser.add_argument("--traits", type=float, default=0.0, metavar="SHARE", help="share of the views with a Gaussian pixel filter, with albedo behind glass, and with another exposure, each [0]")
     parser.add_argument("--ref-spp", type=int, default=128, metavar="N", help="largest number of samples per pixel of the reference [128]")
     parser.add_argument("--residual", type=float, default=0.03, metavar="X", help="expected RelMSE at which a reference is good enough [0.03]")

@@ -191,6 +191,23 @@ class OtherRenderers(Tools):
         same = {name for name in was.channels if (was.channels[name].pixels == now.channels[name].pixels).all()}
         self.assertEqual(set(was.channels) - same, {"ref.R", "ref.G", "ref.B"})
 
+    @unittest.skipIf(importlib.util.find_spec("torch") is None, "no torch")
+    def test_an_albedo_filter_denoises_the_albedo(self) -> None:
+        import demc.torch
+        import numpy as np
+        from demc.torch.exr import ExrFile, read_exr
+
+        model = ROOT / "models" / "quality.safetensors"
+        ended = run("references", "--data", self.data, "-o", self.out, "--albedo-filter", model)
+        self.assertEqual(ended.returncode, 0, ended.stderr)
+        was, now = ExrFile(self.data / "cycles.exr"), ExrFile(self.out / "train" / "cycles.exr")
+        same = {name for name in was.channels if (was.channels[name].pixels == now.channels[name].pixels).all()}
+        albedo = {f"ViewLayer.Denoising Albedo.{name}" for name in "RGB"}
+        self.assertEqual(set(was.channels) - same, {"ref.R", "ref.G", "ref.B"} | albedo)
+        before = read_exr(self.data / "cycles.exr", None, None)
+        expected = demc.torch.load(model).filtered_albedo(before.color, before.features)
+        np.testing.assert_allclose(read_exr(self.out / "train" / "cycles.exr", None, None).features[6:9], expected, atol=1e-3)
+
     def test_baselines_denoise_and_take_a_layer(self) -> None:
         from demc.torch.exr import ExrFile
 

@@ -81,7 +81,7 @@ class Examples(unittest.TestCase):
                 self.assertEqual(changed, 3)
 
     def kernel_model(self) -> Path:
-        """A random network whose kernels differ from pixel to pixel, with the albedo filter of the bundled model."""
+        """A random network whose kernels differ from pixel to pixel, with the albedo filter of a bundled model."""
         import demc.torch
         import torch
         from safetensors.torch import save_file

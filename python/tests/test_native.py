@@ -123,10 +123,12 @@ class Numbers(Native):
     def test_the_model_describes_itself(self) -> None:
         model = demc.Model.load()
         self.assertIs(model, demc.Model.load())
-        self.assertEqual((model.name, model.required, model.takes_layers), ("the bundled model", ("normal", "albedo"), False))
+        self.assertEqual((model.name, model.required, model.takes_layers), ("quality", ("normal", "albedo"), False))
         self.assertEqual(model.metadata["format"], 1)
         self.assertEqual(model.step, model.metadata["step"])
-        file = demc.Model.load(ROOT / "models" / "demc.safetensors")
+        self.assertTrue(demc.Model.load("fast").takes_layers)
+        self.assertIsNot(demc.Model.load("fast"), model)
+        file = demc.Model.load(ROOT / "models" / "quality.safetensors")
         self.assertEqual(file.denoise(self.small, **self.guides).tobytes(), self.clean.tobytes())
         scale = model.input_scale(self.small)
         self.assertEqual(self.denoise(self.small, input_scale=scale).tobytes(), self.clean.tobytes())
@@ -261,7 +263,7 @@ class Refusals(Native):
             path = Path(folder, "x.safetensors")
             with self.assertRaisesRegex(FileNotFoundError, "x.safetensors"):
                 demc.Model.load(path)
-            model = (ROOT / "models" / "demc.safetensors").read_bytes()
+            model = (ROOT / "models" / "quality.safetensors").read_bytes()
             for data, text in [
                 (b"", "x.safetensors"),
                 (model[:1000], "x.safetensors"),

@@ -202,13 +202,13 @@ class Programs(Runs):
     def test_denoise_exr_writes_what_the_built_program_writes(self) -> None:
         source = SAMPLE / "test" / "gen-table-test-1.exr"
         ours, theirs = self.folder / "ours-2.exr", self.folder / "theirs-2.exr"
-        demc.denoise_exr(source, ours, model=ROOT / "models" / "demc.safetensors")
+        demc.denoise_exr(source, ours, model=ROOT / "models" / "quality.safetensors")
         subprocess.run([program("demc-infer"), "denoise", source, "-o", theirs], check=True, capture_output=True)
         self.assertEqual(ours.read_bytes(), theirs.read_bytes())
         for error, text, arguments in (
             (demc.DemcError, "ours-2.exr exists; --overwrite replaces it", (source, ours)),
-            (FileNotFoundError, "none.exr", (self.folder / "none.exr", self.folder / "new.exr")),
             (demc.DemcError, "layers need a model with model.head", (source, self.folder / "new.exr", "R")),
+            (FileNotFoundError, "none.exr", (self.folder / "none.exr", self.folder / "new.exr")),
         ):
             with self.assertRaises(error) as caught:
                 demc.denoise_exr(*arguments[:2], layers=arguments[2:])

@@ -53,7 +53,7 @@ class Wheel(unittest.TestCase):
             succeed(sys.executable, "-m", "venv", programs.parent)
             succeed(programs / "pip", "install", "-q", "--only-binary=:all:", self.wheel)
             output = succeed(programs / "python", "-W", "ignore", "-c", SCRIPT)
-            self.assertEqual(output, "(48, 64, 3) the bundled model\ncycles\n")
+            self.assertEqual(output, "(48, 64, 3) quality\ncycles\n")
             for name in ("demc-infer", "demc-data", "demc-train"):
                 self.assertIn("Usage:", succeed(programs / name, "--help"))
             image = ROOT / "data" / "sample" / "test" / "gen-table-test-1.exr"

@@ -11,6 +11,9 @@ Use it for references of some hundred samples per pixel, which have visible nois
 - Its guides are albedo and normal, both denoised first. They come from the reference's own samples
   if the file has them, otherwise from the noisy image. Their names are `ref.` and the name of the
   noisy channel (`ref.albedo1.R`, `ref.normal.X`, ...; python/render writes them).
+- `--albedo-filter MODEL` also replaces the noisy albedo (first hit) by what an albedo filter makes of it:
+  what a network with that filter sees when it denoises. MODEL is an exported model with a filter, or a
+  filter alone. Needs PyTorch.
 - A pixel gets at most as bright as the noise of its samples allows. This keeps black slats in front
   of a window black.
 - All other channels and attributes are copied. Scenes of the test split are listed, not copied.
@@ -24,13 +27,18 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from dataset import add_layout_flags, albedo, manifest, normal, pixels, reference, write_manifest
 from demc.torch.exr import Frame, read_exr
 from demc.torch.shard import add_shard_flag
 from oidn import with_prefilter
+
+if TYPE_CHECKING:
+    from demc.torch import Bundle
 
 LIGHTER = 3.0
 """Limit for brightening a pixel, in standard deviations of the noise."""
@@ -78,12 +86,20 @@ def noise(plane: np.ndarray) -> np.ndarray:
     return out.clip(LEAST_NOISE, MOST_NOISE)
 
 
+def filtering(path: Path) -> Bundle:
+    """A model with the albedo filter of the file, or with the network of the file as its filter."""
+    from demc.torch import load
+
+    model = load(path)
+    return model if model.albedo_filter else replace(model, albedo_filter=model)
+
+
 def stale(target: Path, source: Path) -> bool:
     """Whether the target is missing or older than the source."""
     return not target.exists() or target.stat().st_mtime < source.stat().st_mtime
 
 
-def rewrite(source: Path, target: Path, layout: str | None, layer: str | None) -> None:
+def rewrite(source: Path, target: Path, layout: str | None, layer: str | None, model: Bundle | None) -> None:
     frame = read_exr(source, layout, layer)
     cleaned = clean(
         reference(frame), guide(frame, "texture1", albedo(frame)), guide(frame, "normal", normal(frame))
@@ -91,13 +107,17 @@ def rewrite(source: Path, target: Path, layout: str | None, layer: str | None) -
     if not np.isfinite(cleaned).all():
         raise ValueError(f"{source}: the denoised reference contains NaN or infinite values")
     target.parent.mkdir(parents=True, exist_ok=True)
-    frame.file.write(target, dict(zip(frame.layout.channels["reference"], cleaned.transpose(2, 0, 1))))
+    planes = dict(zip(frame.layout.channels["reference"], cleaned.transpose(2, 0, 1)))
+    if model:
+        planes |= zip(frame.layout.channels["texture1"], model.filtered_albedo(frame.color, frame.features))
+    frame.file.write(target, planes)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="directory with manifest.json")
     parser.add_argument("-o", "--output", type=Path, required=True, help="directory of the new data set, created if missing")
+    parser.add_argument("--albedo-filter", type=Path, metavar="MODEL", help="exported albedo filter, or a model that has one")
     add_layout_flags(parser)
     add_shard_flag(parser, "training scenes")
     arguments = parser.parse_args()
@@ -105,6 +125,7 @@ def main() -> int:
     try:
         if output.resolve() == data.resolve():
             raise ValueError(f"{output}: expected another directory than --data")
+        model = filtering(arguments.albedo_filter) if arguments.albedo_filter else None
         listed = manifest(data)
         output.mkdir(parents=True, exist_ok=True)
         denoised = 0
@@ -116,7 +137,7 @@ def main() -> int:
                 scene |= {"file": f"train/{scene['name']}.exr", "ref_denoised": "Open Image Denoise"}
                 scene.pop("ref_residual_relmse", None)
                 if scene["name"] in own and stale(output / scene["file"], source):
-                    rewrite(source, output / scene["file"], arguments.layout, arguments.layer)
+                    rewrite(source, output / scene["file"], arguments.layout, arguments.layer, model)
                     denoised += 1
             else:
                 scene["file"] = os.path.relpath(source.resolve(), output.resolve())

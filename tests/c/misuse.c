@@ -1,6 +1,6 @@
 // Wrong calls of the C library, each with its error. use.c has the right ones.
 //
-//   misuse [model.safetensors]     without a model, the bundled one
+//   misuse [model.safetensors]     without a model, "quality"
 //
 // Prints a line per failed check and a summary. Exit code 1 if any failed.
 

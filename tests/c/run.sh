@@ -2,7 +2,7 @@
 # Tests the installed C library: run.sh PREFIX [MODEL]
 #
 # Builds the examples and the tests with the shared and the static library and runs them, then again
-# under valgrind. MODEL should be a small model there; without one, the bundled model is used.
+# under valgrind. MODEL should be a small model there; without one, "quality" is used.
 set -euo pipefail
 [ $# -ge 1 ] || { echo "usage: $0 PREFIX [MODEL]" >&2; exit 2; }
 root=$(cd "$(dirname "$0")/../.." && pwd)

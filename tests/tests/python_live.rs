@@ -53,8 +53,7 @@ fn repository() -> PathBuf {
 }
 
 fn bundled_model() -> Bundle {
-    let path = repository().join("models/demc.safetensors");
-    Bundle::load(&path, &Device::flex()).expect("the model loads")
+    Bundle::load("quality".as_ref(), &Device::flex()).expect("the model loads")
 }
 
 #[test]

@@ -47,22 +47,54 @@ pub struct BundleFile {
     pub albedo_filter: Option<Box<BundleFile>>,
 }
 
-/// The bundled model, described in `models/README.md`.
-const BUNDLED: &[u8] = include_bytes!("../../../models/demc.safetensors");
+/// A model that is inside the program. `models/README.md` describes them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Bundled {
+    /// For 4 samples per pixel: the smaller error there.
+    #[default]
+    Quality,
+    /// For 1 to 256 samples per pixel, in half the time. Takes layers.
+    Fast,
+}
+
+impl Bundled {
+    /// All bundled models.
+    pub const ALL: [Self; 2] = [Self::Quality, Self::Fast];
+
+    /// Its name, where a program or function takes a model.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Quality => "quality",
+            Self::Fast => "fast",
+        }
+    }
+
+    /// The bundled model that `path` names.
+    pub(super) fn named(path: &Path) -> Option<Self> {
+        Self::ALL
+            .into_iter()
+            .find(|model| path.as_os_str() == model.name())
+    }
+
+    const fn bytes(self) -> &'static [u8] {
+        match self {
+            Self::Quality => include_bytes!("../../../models/quality.safetensors"),
+            Self::Fast => include_bytes!("../../../models/fast.safetensors"),
+        }
+    }
+}
 
 impl BundleFile {
-    /// The bundled model's name in messages and in `demc-infer inspect`.
-    pub const BUNDLED: &str = "the bundled model";
-
-    /// The bundled model, which is inside the program.
+    /// A bundled model.
     ///
     /// # Errors
     /// A build with a damaged model.
-    pub fn bundled() -> Result<Self, BundleError> {
-        Self::parse(Self::BUNDLED.into(), BUNDLED)
+    pub fn bundled(model: Bundled) -> Result<Self, BundleError> {
+        Self::parse(model.name().into(), model.bytes())
     }
 
     /// Reads a run directory, a checkpoint directory or a bundle file; see [`super::Bundle::load`].
+    /// The path `quality` or `fast` is the bundled model of that name; `./fast` is a file.
     ///
     /// # Errors
     /// - The file cannot be read, is cut short, is no bundle, or has another format.
@@ -71,6 +103,9 @@ impl BundleFile {
     /// - The content differs from the checksum in the header or, for a directory, in the
     ///   checkpoint's `SHA256SUMS`.
     pub fn read(path: &Path) -> Result<Self, BundleError> {
+        if let Some(model) = Bundled::named(path) {
+            return Self::bundled(model);
+        }
         let file = locate::locate(path)?;
         let bytes = read(&file)?;
         if file != path {

@@ -12,7 +12,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::BundleError;
+use super::{BundleError, Bundled};
 
 /// Best weights of a run, by validation.
 pub const BEST: &str = "best.safetensors";
@@ -65,8 +65,11 @@ const RUN_FILES: [&str; 8] = [
 ];
 
 /// The files that belong to the model at `path`: itself, or those of its run or checkpoint
-/// directory. Some may be missing. Commands do not replace them.
+/// directory. Some may be missing. Commands do not replace them. A bundled model has none.
 pub fn files(path: &Path) -> Vec<PathBuf> {
+    if Bundled::named(path).is_some() {
+        return Vec::new();
+    }
     let mut files = vec![path.to_owned()];
     files.extend(RUN_FILES.map(|name| path.join(name)));
     let checkpoints = entries(&path.join(CHECKPOINTS));

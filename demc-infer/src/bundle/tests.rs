@@ -227,14 +227,19 @@ fn names_with_line_breaks_do_not_break_messages() {
     );
 }
 
-/// The bundled model was exported by the first edition.
+#[test]
+fn the_bundled_models_load_by_name() {
+    for model in Bundled::ALL {
+        let file = BundleFile::read(model.name().as_ref()).expect("a bundled model");
+        assert_eq!(file.path, Path::new(model.name()));
+        file.into_bundle(&Device::flex()).expect("all tensors");
+    }
+    let error = BundleFile::read("./fast".as_ref()).expect_err("a file");
+    assert!(matches!(error, BundleError::Read { .. }), "{error}");
+}
+
 #[test]
 fn a_file_of_the_first_edition_loads() {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/demc.safetensors");
-    let file = BundleFile::read(path.as_ref()).expect("the bundled model");
-    let normalizer = &file.meta.normalizer;
-    assert_eq!(normalizer.albedo_demodulation_epsilon, Some(0.07));
-    file.into_bundle(&Device::flex()).expect("all tensors");
     // Without demodulation the first edition wrote 0, or no such key.
     for text in ["\"demodulate\":0.0,", ""] {
         let json = serde_json::to_string(&bundle(Variant::Demc).meta).expect("JSON");

@@ -53,11 +53,12 @@ fn cache_bytes() -> usize {
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer denoise noisy.exr -o clean.exr
+  demc-infer denoise --model fast noisy.exr -o preview.exr
   demc-infer denoise --model runs/quickstart noisy.exr -o clean.exr --png
   demc-infer denoise --model demc.safetensors renders/ -o denoised/
   demc-infer denoise 'shot.####.exr' --frames 1-10,15,20-40x2 -o denoised/
   demc-infer denoise 'shot.####.exr' --shard 3/8 -o denoised/
-  demc-infer denoise --model runs/kernels shot.exr --layers 'ViewLayer.Combined_*' -o clean.exr")]
+  demc-infer denoise --model fast shot.exr --layers 'ViewLayer.Combined_*' -o clean.exr")]
 pub struct Arguments {
     #[command(flatten)]
     model: ModelFlag,

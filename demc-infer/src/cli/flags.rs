@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use crate::bundle::locate;
 use crate::compute::ComputeFlags;
 use crate::tiles::EXACT_HALO;
-use crate::{Bundle, BundleError, BundleFile, Ensemble, Tiles, Tiling, device};
+use crate::{Bundle, BundleError, BundleFile, Bundled, Ensemble, Tiles, Tiling, device};
 use clap::Args;
 use demc_data::exr::MAX_SIDE;
 use demc_data::output::Outputs;
@@ -15,33 +15,26 @@ use super::UsageError;
 /// `--model`.
 #[derive(Args)]
 pub struct ModelFlag {
-    /// Run directory, checkpoint directory or exported file [default: the bundled model]
-    #[arg(long = "model", value_name = "MODEL")]
-    path: Option<PathBuf>,
+    /// A bundled model (quality or fast), a run directory, a checkpoint directory or an exported file
+    #[arg(long = "model", value_name = "MODEL", default_value = Bundled::default().name())]
+    path: PathBuf,
 }
 
 impl ModelFlag {
     /// The model's name, for a title.
     pub fn name(&self) -> String {
-        match &self.path {
-            Some(path) => path.display().to_string(),
-            None => BundleFile::BUNDLED.into(),
-        }
+        self.path.display().to_string()
     }
 
     /// Protects the model's files from being replaced.
     pub fn protect(&self, outputs: &mut Outputs) {
-        for file in self.path.iter().flat_map(|path| locate::files(path)) {
+        for file in locate::files(&self.path) {
             outputs.protect(&file, "the model");
         }
     }
 
-    /// Reads the given file or the bundled model.
     pub fn read(&self) -> Result<BundleFile, BundleError> {
-        match &self.path {
-            Some(path) => BundleFile::read(path),
-            None => BundleFile::bundled(),
-        }
+        BundleFile::read(&self.path)
     }
 
     pub fn load_onto(&self, device: &DeviceFlag) -> anyhow::Result<Bundle> {

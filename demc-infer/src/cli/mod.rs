@@ -37,8 +37,8 @@ use crate::compute;
 #[derive(Parser)]
 #[command(
     version,
-    after_help = "MODEL is a run directory of demc-train (its best weights), a checkpoint directory, \
-    or a file written by `export`. The default is the bundled model.\n\n\
+    after_help = "MODEL is the bundled model `quality` (the default) or `fast`, a run directory of \
+    demc-train (its best weights), a checkpoint directory, or a file written by `export`.\n\n\
     Exit codes: 0 success, 1 failure, 2 invalid command line."
 )]
 struct Arguments {

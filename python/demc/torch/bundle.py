@@ -122,6 +122,17 @@ class Bundle:
         varies = (noisy.amax((2, 3), True) > noisy.amin((2, 3), True)).any(1, True)
         return torch.cat((features[:, :6], torch.where(varies, filtered, noisy), features[:, 9:]), 1)
 
+    @torch.inference_mode()
+    def filtered_albedo(self, color_hdr: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """The albedo (first hit) that the network sees for one image of any size.
+
+        Arguments as for `denoise`; returns [3, H, W], 0 to 1.
+        """
+        _, feats, _ = preprocess.prepare(color_hdr, features, self.meta)
+        height, width = feats.shape[-2:]
+        found = self.with_filtered_albedo(self._padded(feats)[None])[0, 6:9, :height, :width]
+        return found.clamp(0, MAX_ALBEDO).cpu().numpy()
+
     def tensors(self) -> dict[str, Tensor]:
         """All weights by their PyTorch names, to save them with `meta`; includes the albedo filter."""
         weights = {name: weight.cpu().contiguous() for name, weight in self.model.state_dict().items()}
