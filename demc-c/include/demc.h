@@ -97,7 +97,8 @@ typedef struct DemcModelObject *DemcModel;
 // Reads a model.
 //
 // `path`, in UTF-8: an exported file (.safetensors), a run directory, a checkpoint directory, or the
-// name of a model that is inside the library: "quality" (smaller error) or "fast". NULL is "quality".
+// name of a model that is inside the library: "quality" (for 4 samples per pixel) or "fast" (for 1 to
+// 256). NULL is "quality".
 //
 // Returns NULL on errors: DEMC_ERROR_INVALID_MODEL for a file that cannot be read, is damaged, is no
 // model, or has another format.
@@ -176,8 +177,8 @@ void demcReleaseFilter(DemcFilter filter);
 //
 // "color" and "output" are required, and the features as the model needs them. The bundled models
 // need normal and albedo. Without position, they use zeros; without albedo2, the albedo. Layers
-// need a model with a kernel head, as the bundled ones are. A layer of 3 channels is light, and one
-// of 1 channel is a mask.
+// need a model with a kernel head, such as "fast". A layer of 3 channels is light, and one of 1
+// channel is a mask.
 //
 // `data` is the caller's memory. It must stay valid until the last execution with it has ended. An
 // output may be the same image as an input, because outputs are written last.
