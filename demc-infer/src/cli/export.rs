@@ -4,7 +4,7 @@ use std::env;
 use std::path::{Path, PathBuf};
 
 use crate::bundle::locate;
-use crate::verify::{Runtime, TOLERANCE, verify};
+use crate::verify::{Runtime, TOLERANCE, VALUE_TOLERANCE, verify};
 use crate::{Bundle, BundleFile, Names, Precision};
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
@@ -60,7 +60,7 @@ pub struct Arguments {
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Run the file on synthetic images in ONNX Runtime or PyTorch and compare. Deviations above
-    /// 1e-4 fail
+    /// 1e-4 of the largest value or 1e-3 of a value fail
     #[arg(long)]
     verify: bool,
     /// Python interpreter for --verify [default: the variable DEMC_PYTHON, or python3]
@@ -174,7 +174,8 @@ impl Arguments {
         let path: &Path = &self.output;
         anyhow::ensure!(
             passes,
-            "{}: deviates by more than {TOLERANCE:e} from this program's output",
+            "{}: deviates from this program's output by more than {TOLERANCE:e} of the largest value \
+             or {VALUE_TOLERANCE:e} of a value",
             path.display()
         );
         Ok(())
