@@ -10,8 +10,8 @@
 # repository root.
 #
 # Run it from any directory. It needs demc-train and demc-infer on the PATH. Rendering also needs
-# Python with mitsuba, bpy, pyluxcore, numpy, OpenEXR, pyoidn, safetensors, and torch; PYTHON names the interpreter. Rerun the script to
-# resume it: complete data sets and stages are skipped.
+# Python with mitsuba, bpy, pyluxcore, numpy, OpenEXR, pyoidn, safetensors, and torch; PYTHON names the
+# interpreter. Rerun the script to resume it: complete data sets and stages are skipped.
 #
 # The results resemble the bundled models but have other weights. `fast` was trained on the first 583 of the
 # about 1,550 views that its data set keeps. About `quality`:
@@ -64,12 +64,14 @@ stock() {
     "$python" tests/renderers/data_set.py "$renderer" "$scenes" -o "data/bundled/$name" "$@"
 }
 
-# Denoises the references of a data set: clean NAME RENDERED
+# Denoises the references of a data set: clean NAME RENDERED OPTION...
 clean() {
-    [ -e "data/bundled/$1/complete" ] && return
-    echo "== cleaning the references of data/bundled/$2"
-    "$python" python/tools/references.py --data "data/bundled/$2" -o "data/bundled/$1"
-    touch "data/bundled/$1/complete"
+    name=$1 rendered=$2
+    shift 2
+    [ -e "data/bundled/$name/complete" ] && return
+    echo "== cleaning the references of data/bundled/$rendered"
+    "$python" python/tools/references.py --data "data/bundled/$rendered" -o "data/bundled/$name" "$@"
+    touch "data/bundled/$name/complete"
 }
 
 render_all() {
@@ -150,8 +152,8 @@ done
 filter=runs/bundled/albedo.safetensors
 demc-infer export --model runs/bundled/albedo -o $filter
 if [ -z "$steps" ]; then
-    "$python" python/render -o data/bundled/f --preset train --with "$base"
-    "$python" python/tools/references.py --data data/bundled/f -o data/bundled/clean-f --albedo-filter $filter
+    render f "$base" --preset train
+    clean clean-f f --albedo-filter $filter
 fi
 train fast
 

@@ -96,9 +96,9 @@ typedef struct DemcModelObject *DemcModel;
 
 // Reads a model.
 //
-// `path`, in UTF-8: an exported file (.safetensors), a run directory, a checkpoint directory, or the
-// name of a model that is inside the library: "quality" (for 4 samples per pixel) or "fast" (for 1 to
-// 256). NULL is "quality".
+// `path`, in UTF-8: an exported file (.safetensors), a run directory, or a checkpoint directory. The
+// names "quality" (for 4 samples per pixel) and "fast" (for 1 to 256) are models inside the library.
+// NULL is "quality".
 //
 // Returns NULL on errors: DEMC_ERROR_INVALID_MODEL for a file that cannot be read, is damaged, is no
 // model, or has another format.

@@ -238,8 +238,13 @@ fn the_bundled_models_load_by_name() {
     assert!(matches!(error, BundleError::Read { .. }), "{error}");
 }
 
+/// The bundled model `quality` was exported by the first edition.
 #[test]
 fn a_file_of_the_first_edition_loads() {
+    let file = BundleFile::bundled(Bundled::Quality).expect("the bundled model");
+    let normalizer = &file.meta.normalizer;
+    assert_eq!(normalizer.albedo_demodulation_epsilon, Some(0.07));
+    file.into_bundle(&Device::flex()).expect("all tensors");
     // Without demodulation the first edition wrote 0, or no such key.
     for text in ["\"demodulate\":0.0,", ""] {
         let json = serde_json::to_string(&bundle(Variant::Demc).meta).expect("JSON");

@@ -8,17 +8,19 @@ use std::process::{Command, Output, Stdio};
 
 use demc_data::frame::FEATURES;
 use demc_data::{FeatureStats, Frame};
+use demc_model::Head;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::bundle::tensors::f32_bytes;
 use crate::{Bundle, DenoiseError};
 
-/// Largest accepted deviation relative to the batch's largest value.
+/// Largest accepted deviation.
 pub const TOLERANCE: f32 = 1e-4;
-/// Largest accepted deviation relative to each value. A kernel head averages dark pixels with fireflies
-/// of a thousand times their radiance, whose rounding errors then reach 8e-4 of a value.
-pub const VALUE_TOLERANCE: f32 = 1e-3;
+/// Largest accepted deviation relative to a value of a network with kernel head, which averages dark
+/// pixels with fireflies. Measured beside a firefly of 65,000 times the radiance: ONNX Runtime deviates
+/// from float64 by 2.5e-4, and from this program by 8e-4.
+pub const KERNEL_TOLERANCE: f32 = 1e-3;
 /// Images, height and width of the compared batches: square and not, one image and two.
 pub const SIZES: [[usize; 3]; 4] = [[1, 32, 32], [1, 96, 160], [2, 224, 32], [1, 256, 256]];
 /// Epsilon of RelMSE (Eq. 5).
@@ -65,10 +67,12 @@ pub struct Deviation {
     /// Largest difference relative to `sqrt(x^2 + 0.001)`, the weight in RelMSE (Eq. 5): about the
     /// value itself, and 0.03 for dark values.
     pub of_value: f32,
+    /// Largest accepted `of_value`.
+    limit_of_value: f32,
 }
 
 impl Deviation {
-    fn of(size: [usize; 3], found: &[f32], expected: &[f32]) -> Self {
+    fn of(size: [usize; 3], head: Head, found: &[f32], expected: &[f32]) -> Self {
         let largest = expected.iter().fold(0.0f32, |m, x| m.max(x.abs()));
         let worst = |relative: &dyn Fn(f32, f32) -> f32| {
             let differences = found.iter().zip(expected).map(|(f, e)| relative(*f, *e));
@@ -85,12 +89,17 @@ impl Deviation {
                 difference => difference / largest,
             }),
             of_value: worst(&|f, e| (f - e).abs() / (e * e + RELMSE_EPSILON).sqrt()),
+            limit_of_value: match head {
+                Head::Kernel => KERNEL_TOLERANCE,
+                Head::Grey | Head::Xavier => TOLERANCE,
+            },
         }
     }
 
-    /// Whether both are within [`TOLERANCE`] and [`VALUE_TOLERANCE`].
+    /// Whether both are within [`TOLERANCE`], or within [`KERNEL_TOLERANCE`] for the values of a
+    /// kernel head.
     pub fn passes(&self) -> bool {
-        self.of_largest <= TOLERANCE && self.of_value <= VALUE_TOLERANCE
+        self.of_largest <= TOLERANCE && self.of_value <= self.limit_of_value
     }
 }
 
@@ -171,6 +180,7 @@ pub fn verify(
         )?;
         outputs.push(output);
     }
+    let head = expected.meta.model.head;
     let runtime = run(file, runtime, python, folder.path())?;
     let mut deviations = Vec::with_capacity(SIZES.len());
     for ((i, size), expected) in SIZES.into_iter().enumerate().zip(outputs) {
@@ -184,7 +194,7 @@ pub fn verify(
                 detail: format!("{} values instead of {}", found.len(), expected.len()),
             });
         }
-        deviations.push(Deviation::of(size, &found, &expected));
+        deviations.push(Deviation::of(size, head, &found, &expected));
     }
     Ok(Verification {
         runtime,
@@ -284,15 +294,24 @@ mod tests {
     #[test]
     fn deviations_are_relative_to_the_largest_and_to_each_value() {
         let size = [1, 1, 1];
-        let deviation = Deviation::of(size, &[10.0, 0.01, 0.0], &[10.0, 0.0, 0.0]);
+        let deviation = Deviation::of(size, Head::Grey, &[10.0, 0.01, 0.0], &[10.0, 0.0, 0.0]);
         assert!((deviation.of_largest - 1e-3).abs() < 1e-9);
         assert!((deviation.of_value - 0.01 / 0.001f32.sqrt()).abs() < 1e-6);
         assert!(!deviation.passes());
-        assert!(Deviation::of(size, &[0.0, 2.0], &[0.0, 2.0]).passes());
+        assert!(Deviation::of(size, Head::Grey, &[0.0, 2.0], &[0.0, 2.0]).passes());
         for nan in [[f32::NAN, 2.0], [0.0, f32::NAN]] {
-            assert!(!Deviation::of(size, &nan, &[0.0, 2.0]).passes());
+            assert!(!Deviation::of(size, Head::Grey, &nan, &[0.0, 2.0]).passes());
         }
-        assert!(!Deviation::of(size, &[1e-3], &[0.0]).passes());
+        assert!(!Deviation::of(size, Head::Grey, &[1e-3], &[0.0]).passes());
+        // 6e-4 of a dark value, 1e-5 of the largest.
+        for (head, passes) in [
+            (Head::Grey, false),
+            (Head::Xavier, false),
+            (Head::Kernel, true),
+        ] {
+            let deviation = Deviation::of(size, head, &[2.0, 2e-5], &[2.0, 0.0]);
+            assert_eq!(deviation.passes(), passes);
+        }
     }
 
     #[test]
