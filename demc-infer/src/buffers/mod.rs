@@ -8,9 +8,9 @@
 //!
 //! ```
 //! use demc_infer::buffers::{Buffers, Sample, View, ViewMut};
-//! use demc_infer::{BundleFile, Bundled, device};
+//! use demc_infer::{Bundle, device};
 //!
-//! let bundle = BundleFile::bundled(Bundled::Quality)?.into_bundle(&device::parse("flex")?)?;
+//! let bundle = Bundle::load("quality".as_ref(), &device::parse("flex")?)?;
 //! let (height, width) = (48, 64);
 //! // Interleaved float samples, as in most renderers, of an image and of its features.
 //! let [color, normal, albedo] = [(); 3].map(|()| vec![0u8; height * width * 3 * 4]);
