@@ -112,15 +112,16 @@ def main() -> None:
 def drawn_counts(args, rng: np.random.Generator) -> list[int]:
     """The numbers of samples per pixel of a view's noisy images, in order.
 
-    The largest one is drawn, small ones more often; the others are drawn from those below it, whose
-    samples are traced anyway.
+    One is drawn for the reference to serve, large ones less often because they cost most. The
+    others are drawn from all that this reference serves, too.
     """
     if not args.counts:
         return args.spp
-    chances = 1 / np.sqrt(args.spp)
-    largest = int(rng.choice(len(args.spp), p=chances / chances.sum()))
-    others = rng.choice(args.spp[:largest], min(args.counts - 1, largest), replace=False) if largest else []
-    return sorted([*map(int, others), args.spp[largest]])
+    chances = np.cbrt(1 / np.array(args.spp))
+    served = int(rng.choice(args.spp, p=chances / chances.sum()))
+    limit = max(served, args.ref_spp // views.REFERENCE_SHARE)
+    others = [count for count in args.spp if count <= limit and count != served]
+    return sorted([served, *map(int, rng.choice(others, min(args.counts - 1, len(others)), replace=False))])
 
 
 def own_scenes(args, budget: views.Budget) -> Iterator[Base]:
@@ -214,7 +215,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--black", type=float, default=0.2, metavar="SHARE", help="share of the rooms with black bars and blinds [0.2]")
     parser.add_argument("--studio", type=float, default=0.15, metavar="SHARE", help="share of the still lifes in a black studio [0.15]")
     parser.add_argument("--spp", type=numbers, default=[4], metavar="N,...", help="samples per pixel of the noisy images [4]")
-    parser.add_argument("--counts", type=int, metavar="N", help="largest number of noisy images per view, drawn from --spp, small ones more often [all]")
+    parser.add_argument("--counts", type=int, metavar="N", help="largest number of noisy images per view, drawn from --spp [all]")
     parser.add_argument("--traits", type=float, default=0.0, metavar="SHARE", help="share of the views with a Gaussian pixel filter, with albedo behind glass, and with another exposure, each [0]")
     parser.add_argument("--ref-spp", type=int, default=128, metavar="N", help="largest number of samples per pixel of the reference [128]")
     parser.add_argument("--residual", type=float, default=0.03, metavar="X", help="expected RelMSE at which a reference is good enough [0.03]")
