@@ -13,6 +13,8 @@ const LR_START: f64 = 1e-4;
 const LR_END: f64 = 5e-6;
 /// Learning rates. Ours: those of trainings are from 1e-7 to 0.1, and others end in NaN.
 const RATES: RangeInclusive<f64> = 1e-30..=10.0;
+/// Largest weight decay. Ours: at learning rates up to 0.1 it never removes more than a kernel.
+const MAX_DECAY: f64 = 10.0;
 /// Adam's epsilon (Kingma and Ba 2014).
 const ADAM_EPSILON: f32 = 1e-8;
 /// Largest matrix for Muon, in rows. Ours: every kernel of the level widths that this project
@@ -40,6 +42,9 @@ pub struct OptimizerConfig {
     /// "muon"`. Rows are the output channels of a kernel. Absent: 128.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub muon_max_rows: Option<usize>,
+    /// Share of every kernel that a step at learning rate 1 removes (decoupled weight decay,
+    /// Loshchilov and Hutter 2019). Paper: none.
+    pub weight_decay: f64,
     /// Learning rate of the first step.
     pub lr_start: f64,
     /// Learning rate at the end of the run.
@@ -62,6 +67,7 @@ impl Default for OptimizerConfig {
         OptimizerConfig {
             kind: OptimizerKind::Adam,
             muon_max_rows: None,
+            weight_decay: 0.0,
             lr_start: LR_START,
             lr_end: LR_END,
             lr_decay: LrDecay::Exponential,
@@ -81,6 +87,13 @@ impl OptimizerConfig {
             let allowed = format!("from {least:e} to {most}");
             problems.require(RATES.contains(&value), key, &value, &allowed);
         }
+        let decay = self.weight_decay;
+        problems.require(
+            (0.0..=MAX_DECAY).contains(&decay),
+            "weight_decay",
+            &decay,
+            &format!("from 0 to {MAX_DECAY}"),
+        );
         problems.require_positive("adam_epsilon", self.adam_epsilon.into());
         if let Some(norm) = self.max_grad_norm {
             let holds = norm.is_finite() && norm > 0.0;

@@ -199,7 +199,7 @@ impl RunMonitor {
         self.once(WarningTopic::Dormant, || {
             format!(
                 "{:.0} % of the network's channels are dormant: zero everywhere, without a gradient for 175 steps; \
-                 optimizer.kind = \"muon\" or a smaller optimizer.lr_start keeps more of them active",
+                 optimizer.kind = \"muon\", optimizer.weight_decay or a smaller optimizer.lr_start keeps more of them active",
                 100.0 * share
             )
         })

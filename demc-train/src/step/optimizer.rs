@@ -37,6 +37,7 @@ pub struct Optimizer {
     constants: AdamConstants,
     /// Rows up to which Muon updates a kernel; `None` with Adam alone.
     muon_rows: Option<usize>,
+    weight_decay: f64,
     steps: u64,
     /// Every weight of the network, in module order.
     specs: Vec<WeightSpec>,
@@ -94,6 +95,7 @@ impl Optimizer {
         Optimizer {
             constants,
             muon_rows: config.optimizer.muon_rows(),
+            weight_decay: config.optimizer.weight_decay,
             steps: 0,
             specs: config.model.weight_specs(),
             states: BTreeMap::new(),
@@ -126,16 +128,22 @@ impl Optimizer {
         model
     }
 
-    /// Counts the dormant channels, from Adam's moments of the biases.
+    /// Counts the dormant channels, from Adam's moments of the shifts before the ReLUs: the biases,
+    /// or the shift of a normalisation that follows.
     pub fn dormant(&self) -> DormantChannels {
         let mut count = DormantChannels::default();
-        let biases = self.specs.iter();
-        for spec in biases
-            .filter(|spec| spec.role == Role::Bias && !matches!(spec.stage, Stage::Head { .. }))
-        {
+        for (spec, next) in self.specs.iter().zip(self.specs.iter().skip(1)) {
+            let is_shift = match spec.role {
+                // A normalisation cancels the bias before it.
+                Role::Bias => !next.role.is_norm() && !matches!(spec.stage, Stage::Head { .. }),
+                role => role == Role::NormShift,
+            };
             let Some(WeightState::Adam(moments)) = self.states.get(&spec.name) else {
                 continue;
             };
+            if !is_shift {
+                continue;
+            }
             for (first, second) in values(&moments.first)
                 .into_iter()
                 .zip(values(&moments.second))
@@ -253,26 +261,26 @@ impl ModuleMapper for OptimizerStep<'_> {
         assert_eq!(spec.shape, tensor.dims(), "{}", spec.name);
         let optimizer = &mut *self.optimizer;
         let state = optimizer.states.remove(&spec.name);
+        let mut weight = tensor.inner();
+        if optimizer.weight_decay > 0.0 && spec.rows().is_some() {
+            weight = weight.mul_scalar(1.0 - self.lr * optimizer.weight_decay);
+        }
         let (stepped, state) = if optimizer.is_for_muon(spec) {
             let velocity = match state {
                 Some(WeightState::Muon(velocity)) => Some(velocity),
                 _ => None,
             };
-            let (stepped, velocity) = muon::step(spec, self.lr, tensor.inner(), grad, velocity);
+            let (stepped, velocity) = muon::step(spec, self.lr, weight, grad, velocity);
             (stepped, WeightState::Muon(velocity))
         } else {
             let moments = match state {
                 Some(WeightState::Adam(moments)) => Some(moments),
                 _ => None,
             };
-            let (stepped, moments) = optimizer.constants.step(
-                self.ops,
-                self.lr,
-                optimizer.steps,
-                tensor.inner(),
-                grad,
-                moments,
-            );
+            let (stepped, moments) =
+                optimizer
+                    .constants
+                    .step(self.ops, self.lr, optimizer.steps, weight, grad, moments);
             (stepped, WeightState::Adam(moments))
         };
         optimizer.states.insert(spec.name.clone(), state);

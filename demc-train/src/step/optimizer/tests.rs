@@ -103,6 +103,31 @@ fn muon_updates_kernels_up_to_its_rows_except_the_head() {
     }
 }
 
+/// Against a step without decay, Adam's and Muon's kernels lose `lr * weight_decay` of themselves;
+/// biases and normalisations lose nothing.
+#[test]
+fn weight_decay_shrinks_kernels_only() {
+    let device = Device::flex().autodiff();
+    let mut model = model(&device);
+    model = Optimizer::new(&muon()).step(LR, model.clone(), gradient(&model, &device));
+    let grads = || gradient(&model, &device);
+    let mut config = muon();
+    let plain = Optimizer::new(&config).step(LR, model.clone(), grads());
+    config.optimizer.weight_decay = 0.5;
+    let decayed = Optimizer::new(&config).step(LR, model.clone(), grads());
+    let specs = model.config().weight_specs();
+    let specs = specs.into_iter().filter(|spec| spec.role.is_trainable());
+    let weights = [&model, &plain, &decayed].map(trainable);
+    for (i, spec) in specs.enumerate() {
+        let share = if spec.rows().is_some() { 0.5 * LR } else { 0.0 };
+        for (k, before) in weights[0][i].data.iter().enumerate() {
+            let [plain, decayed] = [1, 2].map(|w: usize| weights[w][i].data[k]);
+            let expected = plain - share as f32 * before;
+            assert!((decayed - expected).abs() < 1e-6, "{}", spec.name);
+        }
+    }
+}
+
 #[test]
 fn a_restored_optimizer_resumes_bit_for_bit() {
     let device = Device::flex().autodiff();

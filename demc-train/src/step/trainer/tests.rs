@@ -1,6 +1,6 @@
 use std::convert::Infallible;
 
-use demc_model::{ModelConfig, WeightSpec, Weights};
+use demc_model::{ModelConfig, Reading, WeightSpec, Weights};
 
 use super::*;
 use crate::run::initial::random_network;
@@ -229,13 +229,13 @@ fn the_result_is_the_average() {
     assert!(averaged.result().weights() != averaged.model().weights());
 }
 
-/// Channels whose bias is far below zero get no gradient.
-#[test]
-fn dormant_channels_are_counted_once_they_can_be_known() {
-    let config = config(2, 1);
+/// Channels whose bias, or shift of a normalisation, is far below zero get no gradient.
+fn dormant_channels_are_counted_once_they_can_be_known(reading: Reading, shift: &str) {
+    let mut config = config(2, 1);
+    config.model.reading = reading;
     let device = Device::flex().autodiff();
     let mut weights = random_network(&config.model, 1, [0.3; 3], &device).weights();
-    let latent = weights.iter_mut().find(|w| w.name == "latent.conv.bias");
+    let latent = weights.iter_mut().find(|w| w.name == shift);
     latent.expect("a latent").data.fill(-100.0);
     let model = config.model.load(&mut Weights::new(weights), &device);
     let optimizer = Optimizer::new(&config);
@@ -254,6 +254,16 @@ fn dormant_channels_are_counted_once_they_can_be_known() {
     let biases = biases.filter(|spec| spec.name.ends_with(".bias"));
     let channels: usize = biases.map(WeightSpec::len).sum();
     assert_eq!(found.channels, channels - 3, "all but the head's");
-    // The latent has 16 channels.
-    assert!((16..found.channels).contains(&found.dormant), "{found:?}");
+    // The latent has 16 channels; others that feed only it lose their gradient with it.
+    assert!((16..=48).contains(&found.dormant), "{found:?}");
+}
+
+#[test]
+fn dormant_channels_of_biases() {
+    dormant_channels_are_counted_once_they_can_be_known(Reading::Paper, "latent.conv.bias");
+}
+
+#[test]
+fn dormant_channels_of_normalisations() {
+    dormant_channels_are_counted_once_they_can_be_known(Reading::Released, "latent.norm.beta");
 }
