@@ -6,9 +6,9 @@
 
 Both denoise an image in memory with as many threads as there are processors. Each round measures each
 program in a process of its own, in turn: OIDN with its own `oidnBenchmark` (HDR colour, albedo, and
-normal), the models with `demc.denoise`, including albedo filter and restored light. A process denoises
-once without a clock, and then three times. The table has medians, and the median and quartiles of the
-ratios of each round.
+normal), its passes over albedo and normal alone, the models with `demc.denoise`, including albedo filter
+and restored light. A process denoises once without a clock, and then three times. The table has medians,
+and the median and quartiles of the ratios of each round.
 """
 
 from __future__ import annotations
@@ -44,9 +44,37 @@ for _ in range(passes + 1):
 print(sum(times[1:]) / passes)
 """
 
+GUIDES = """
+import sys, time, numpy as np, pyoidn
+quality, height, width, passes = sys.argv[1], *map(int, sys.argv[2:])
+feature = np.random.default_rng(1).random((height, width, 3), np.float32)
+denoised = np.empty_like(feature)
+seconds = 0
+for kind in ("albedo", "normal"):
+    with pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CPU) as device:
+        device.commit()
+        filter = pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT)
+        filter.set_image(kind, feature, pyoidn.OIDN_FORMAT_FLOAT3)
+        filter.set_image(pyoidn.OIDN_IMAGE_OUTPUT, denoised, pyoidn.OIDN_FORMAT_FLOAT3)
+        filter.set_quality(getattr(pyoidn, f"OIDN_QUALITY_{quality.upper()}"))
+        filter.commit()
+        for count in (1, passes):
+            start = time.perf_counter()
+            for _ in range(count):
+                filter.execute()
+        seconds += (time.perf_counter() - start) / passes
+        filter.release()
+print(seconds)
+"""
+
 
 def model_seconds(name: str) -> float:
     command = [sys.executable, "-W", "ignore", "-c", DENOISE, SAMPLE, name, HEIGHT, WIDTH, PASSES]
+    return float(subprocess.run([*map(str, command)], check=True, capture_output=True, text=True).stdout)
+
+
+def guides_seconds(quality: str) -> float:
+    command = [sys.executable, "-c", GUIDES, quality, HEIGHT, WIDTH, PASSES]
     return float(subprocess.run([*map(str, command)], check=True, capture_output=True, text=True).stdout)
 
 
@@ -63,16 +91,19 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7, metavar="N", help="rounds [7]")
     args = parser.parse_args()
     rounds = [
-        {model: (model_seconds(model), oidn_seconds(quality)) for model, quality in PAIRS.items()}
+        {model: (model_seconds(model), oidn_seconds(quality), guides_seconds(quality)) for model, quality in PAIRS.items()}
         for _ in range(args.rounds)
     ]
-    print("| model | s | OIDN | s | ratio |\n|---|---:|---|---:|---:|")
+    print("| model | s | OIDN | s | ratio | both denoised first, s | ratio |\n|---|---:|---|---:|---:|---:|---:|")
     for model, quality in PAIRS.items():
-        ours, theirs = zip(*(measured[model] for measured in rounds))
-        ratios = [mine / other for mine, other in zip(ours, theirs)]
-        low, _, high = statistics.quantiles(ratios, n=4) if len(ratios) > 1 else ratios * 3
-        shares = f"{statistics.median(ratios):.2f} ({low:.2f} to {high:.2f})"
-        print(f"| {model} | {statistics.median(ours):.2f} | {quality} | {statistics.median(theirs):.2f} | {shares} |")
+        ours, plain, guides = zip(*(measured[model] for measured in rounds))
+        whole = [first + last for first, last in zip(guides, plain)]
+        cells = [model, f"{statistics.median(ours):.2f}", quality]
+        for theirs in (plain, whole):
+            ratios = [mine / other for mine, other in zip(ours, theirs)]
+            low, _, high = statistics.quantiles(ratios, n=4) if len(ratios) > 1 else ratios * 3
+            cells += [f"{statistics.median(theirs):.2f}", f"{statistics.median(ratios):.2f} ({low:.2f} to {high:.2f})"]
+        print(f"| {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":

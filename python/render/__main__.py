@@ -48,7 +48,7 @@ COUNTS = [1, 2, 4, 8, 16, 32, 64, 128, 256]
 PRESETS = {
     "train": {"rooms": 680, "stills": 380, "size": 192, "spp": COUNTS, "counts": 3, "traits": 0.25, "seed": 29},
     "heldout": {
-        "rooms": 78, "stills": 20, "views": 1, "size": 256, "spp": COUNTS[::2], "ref_spp": 2048, "residual": 0.0,
+        "rooms": 78, "stills": 20, "views": 1, "size": 192, "spp": COUNTS[::2], "ref_spp": 2048, "residual": 0.0,
         "reserved": True, "split": "test", "seed": 1029,
     },
 }
