@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+
 import numpy as np
 
 
@@ -16,9 +18,17 @@ def with_prefilter(color: np.ndarray, albedo: np.ndarray, normal: np.ndarray, qu
 
 def prefiltered(kind: str, feature: np.ndarray, quality: str = "high") -> np.ndarray:
     """One feature, `albedo` or `normal`, denoised without guides; `quality` is `high` or `fast`."""
+    out = np.empty_like(feature)
+    with feature_filter(kind, feature, out, quality) as filter:
+        filter.execute()
+    return out
+
+
+@contextmanager
+def feature_filter(kind: str, feature: np.ndarray, out: np.ndarray, quality: str):
+    """A filter whose `execute` denoises a feature into `out`. The end raises RuntimeError if a step failed."""
     import pyoidn
 
-    out = np.empty_like(feature)
     with pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CPU) as device:
         device.commit()
         filter = pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT)
@@ -27,10 +37,9 @@ def prefiltered(kind: str, feature: np.ndarray, quality: str = "high") -> np.nda
             filter.set_image(pyoidn.OIDN_IMAGE_OUTPUT, out, pyoidn.OIDN_FORMAT_FLOAT3)
             filter.set_quality(getattr(pyoidn, f"OIDN_QUALITY_{quality.upper()}"))
             filter.commit()
-            filter.execute()
+            yield filter
             message = device.get_error()
         finally:
             filter.release()
     if message is not None:
         raise RuntimeError(f"Open Image Denoise, {kind} alone: {message}")
-    return out
