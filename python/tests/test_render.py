@@ -307,7 +307,7 @@ class Render(unittest.TestCase):
 
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder)
-            ask = ("--preset", "train", "--rooms", 0, "--stills", 4, "--views", 1, "--size", 32, "--ref-spp", 32, "--spp", "1,2,4", "--traits", 1)
+            ask = ("--preset", "train", "--rooms", 0, "--stills", 4, "--views", 1, "--size", 32, "--ref-spp", 32, "--spp", "1,2,4,8", "--traits", 1)
             ended = run("-o", out, *ask)
             self.assertEqual(ended.returncode, 0, ended.stderr)
             scenes = json.loads((out / "manifest.json").read_text())["scenes"]
