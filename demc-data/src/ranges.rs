@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::frame::{FEATURES, Frame, TEXTURES};
 use crate::moments::{ChannelMoments, hit_samples};
+use crate::parallel::{self, threads};
 
 /// Rec. 709 luminance of red, green and blue.
 pub(crate) const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
@@ -42,11 +43,14 @@ impl FrameSummary {
     /// The summary of a frame.
     pub fn of(frame: &Frame) -> Self {
         let pixels = frame.width * frame.height;
-        let mut planes = frame.features.chunks_exact(pixels.max(1));
-        let features = std::array::from_fn(|channel| {
-            let plane = planes.next().unwrap_or_default().to_vec();
-            ChannelMoments::of(&hit_samples(channel, plane, frame.mask.as_deref()))
-        });
+        let planes = frame.features.chunks_exact(pixels.max(1)).enumerate();
+        let moments = |(channel, plane): (usize, &[f32])| {
+            let samples = hit_samples(channel, plane.to_vec(), frame.mask.as_deref());
+            ChannelMoments::of(&samples)
+        };
+        let features = parallel::map(threads().count, planes.collect(), moments);
+        let mut features = features.into_iter();
+        let features = std::array::from_fn(|_| features.next().unwrap_or_default());
         Self::new(&frame.color, &features)
     }
 

@@ -88,7 +88,7 @@ impl Normalizer {
     /// # Panics
     /// If the length is not a multiple of 12.
     pub fn modulation(&self, features: &[f32]) -> Option<Vec<f32>> {
-        let epsilon = self.albedo_demodulation_epsilon?;
+        self.albedo_demodulation_epsilon?;
         assert_eq!(
             features.len() % FEATURES,
             0,
@@ -96,11 +96,20 @@ impl Normalizer {
         );
         let size = features.len() / FEATURES;
         let mut texture = features[TEXTURES * size..(TEXTURES + 3) * size].to_vec();
-        for value in &mut texture {
+        self.modulation_from_albedo(&mut texture);
+        Some(texture)
+    }
+
+    /// As [`modulation`](Self::modulation), in place and for any part of the albedo. Without an epsilon
+    /// nothing changes.
+    pub fn modulation_from_albedo(&self, albedo: &mut [f32]) {
+        let Some(epsilon) = self.albedo_demodulation_epsilon else {
+            return;
+        };
+        for value in &mut *albedo {
             *value = value.clamp(0.0, MAX_ALBEDO) + epsilon;
         }
-        gamma_from_hdr(&mut texture, self.gamma);
-        Some(texture)
+        gamma_from_hdr(albedo, self.gamma);
     }
 
     /// Compresses linear radiance in place, `max(x, 0)^(1/gamma)` (Eq. 4), and divides it by the

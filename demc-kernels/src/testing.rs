@@ -15,6 +15,19 @@ pub(crate) fn grids() -> Vec<Grid> {
             (3, 2, 2),
         ],
     };
+    all(sizes)
+}
+
+/// [`grids`], and grids whose lines are longer than a block of pixels.
+pub(crate) fn grids_and_wide_ones() -> Vec<Grid> {
+    let mut grids = grids();
+    if !cfg!(miri) {
+        grids.extend(all(vec![(1, 2, 192), (2, 2, 200)]));
+    }
+    grids
+}
+
+fn all(sizes: Vec<(usize, usize, usize)>) -> Vec<Grid> {
     let grids = sizes.into_iter().map(|(batch, height, width)| Grid {
         batch,
         height,

@@ -42,8 +42,7 @@ impl FrameInput<'_> {
         let own = FrameInput {
             color: &color,
             // The filter takes the positions of the network ([`BundleMeta::filter_problem`]).
-            positions: self.positions,
-            ..FrameInput::new(filter, frame)?
+            ..FrameInput::with_positions(filter, frame, self.positions)?
         };
         let tiles = filter.tiles(frame.height, frame.width, &tiling.exact(), Ensemble::One);
         let tiles = tiles.map_err(|source| DenoiseError::Memory {

@@ -62,6 +62,17 @@ impl<'a> FrameInput<'a> {
     /// The input of one pass; fails for buffers of the wrong size.
     pub(super) fn new(bundle: &'a Bundle, frame: &'a Frame) -> Result<Self, DenoiseError> {
         check_sizes(frame)?;
+        let positions = bundle.meta.normalizer.position_map(&frame.features);
+        Self::with_positions(bundle, frame, positions)
+    }
+
+    /// As [`new`](Self::new), with a known mapping of the positions.
+    pub(super) fn with_positions(
+        bundle: &'a Bundle,
+        frame: &'a Frame,
+        positions: Option<PositionMap>,
+    ) -> Result<Self, DenoiseError> {
+        check_sizes(frame)?;
         Ok(Self {
             bundle,
             frame,
@@ -76,7 +87,7 @@ impl<'a> FrameInput<'a> {
             ensemble: Ensemble::One,
             scale: 1.0,
             demodulate: true,
-            positions: bundle.meta.normalizer.position_map(&frame.features),
+            positions,
         })
     }
 
@@ -256,8 +267,15 @@ impl<'a> FrameInput<'a> {
         }
         let mut features = self.features(rows, columns);
         let modulation = match self.demodulate {
-            true => meta.normalizer.modulation(&features),
-            false => None,
+            true if demodulates => {
+                let pixels = rows.len() * columns.len();
+                let mut albedo = features[TEXTURES * pixels..][..COLOR_CHANNELS * pixels].to_vec();
+                in_pieces(&mut albedo, None, |albedo, _| {
+                    meta.normalizer.modulation_from_albedo(albedo);
+                });
+                Some(albedo)
+            }
+            _ => None,
         };
         meta.normalizer.features_z_from_raw(&mut features);
         let features_z = self.tensor::<FEATURES>(features, rows, columns);

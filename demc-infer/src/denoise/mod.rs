@@ -141,13 +141,17 @@ impl Bundle {
                 source,
             })?;
         }
-        let mut input = FrameInput::new(self, frame)?;
-        input.ensemble = ensemble;
-        input.scale = match input_scale {
+        let scale = || match input_scale {
             Some(scale) => *scale,
             None => self.input_scale(demc_data::ranges::exposure(&frame.color)),
         };
-        self.check_statistics(frame)?;
+        let input = || FrameInput::new(self, frame);
+        let statistics = || self.check_statistics(frame);
+        let (input, (statistics, scale)) = rayon::join(input, || rayon::join(statistics, scale));
+        let mut input = input?;
+        statistics?;
+        input.ensemble = ensemble;
+        input.scale = scale;
         let observer: &mut DenoiseObserver = &mut observer;
         input.filter_albedo(tiling, observer)?;
         let size = Padding {
@@ -219,10 +223,7 @@ impl Bundle {
     /// # Errors
     /// As [`denoise`](Self::denoise).
     pub(crate) fn run_graph(&self, frame: &Frame) -> Result<Vec<f32>, DenoiseError> {
-        let mut input = FrameInput {
-            positions: None,
-            ..FrameInput::new(self, frame)?
-        };
+        let mut input = FrameInput::with_positions(self, frame, None)?;
         input.filter_albedo(&Tiling::default(), &mut unobserved)?;
         let padded = (input.padding.padded_height(), input.padding.padded_width());
         let tiles = Tiles::plan(padded, &Tiling::default(), |_, _| 0, None);

@@ -42,12 +42,13 @@ impl Bundle {
     /// A buffer that does not have the frame's size.
     pub fn warnings(&self, frame: &Frame) -> Result<Vec<Warning>, DenoiseError> {
         check_sizes(frame)?;
-        let mut warnings = geometry::warnings(frame);
+        let summary = || self.meta.ranges.as_ref().map(|_| FrameSummary::of(frame));
+        let (mut warnings, summary) = rayon::join(|| geometry::warnings(frame), summary);
         // A buffer with a known mistake also drifts: one warning is enough.
-        if let Some(ranges) = &self.meta.ranges {
+        if let Some((ranges, summary)) = self.meta.ranges.as_ref().zip(summary) {
             let known: Vec<String> = warnings.iter().map(|w| w.what.clone()).collect();
             let position = self.meta.normalizer.position;
-            let drift = drift::warnings(&FrameSummary::of(frame), ranges, position);
+            let drift = drift::warnings(&summary, ranges, position);
             let named = |warning: &Warning| known.iter().any(|what| warning.what.contains(what));
             warnings.extend(drift.into_iter().filter(|warning| !named(warning)));
         }

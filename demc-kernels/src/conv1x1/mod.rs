@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use crate::product::padded_rows;
-use crate::rows::{self, BLOCK, Copy, Outer, Packed, PaddedRows, Term, copy, whole};
+use crate::rows::{self, BLOCK, Copy, Outer, Packed, PaddedRows, Term, copy, finish, whole};
 use crate::scratch::Scratch;
 use crate::{Grid, Isa};
 
@@ -137,6 +137,18 @@ fn products(
                     weight,
                 })
                 .collect();
+            let add = if epilogue.add {
+                rows::add_sum
+            } else {
+                rows::sum
+            };
+            if rows::fits(count, outputs) && (epilogue.bias.is_some() || !epilogue.relu) {
+                add(isa, count, &terms, y, outputs);
+                if let Some(bias) = epilogue.bias {
+                    finish(isa, bias, epilogue.relu, y);
+                }
+                return;
+            }
             let mut c = Scratch::take(padded_rows(count) * wide);
             if epilogue.add {
                 copy(
@@ -153,10 +165,8 @@ fn products(
                         channels: outputs,
                     },
                 );
-                rows::add_sum(isa, count, &terms, &mut c, wide);
-            } else {
-                rows::sum(isa, count, &terms, &mut c, wide);
             }
+            add(isa, count, &terms, &mut c, wide);
             copy(
                 isa,
                 Copy {

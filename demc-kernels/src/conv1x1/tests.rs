@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::reference;
-use crate::testing::{assert_close, f64s, few, grids, pattern};
+use crate::testing::{assert_close, f64s, few, grids_and_wide_ones, pattern};
 
 fn concatenated(grid: Grid, xs: &[&[f32]]) -> Vec<f64> {
     let rows = (0..grid.pixels()).flat_map(|p| {
@@ -18,9 +18,12 @@ fn concatenated(grid: Grid, xs: &[&[f32]]) -> Vec<f64> {
 
 #[test]
 fn parts_added_one_by_one_are_the_whole() {
-    let (inputs, outputs) = ([20, 3, 16], 18);
+    let inputs = [20, 3, 16];
     for isa in Isa::available() {
-        for grid in grids() {
+        for (grid, outputs) in grids_and_wide_ones()
+            .into_iter()
+            .flat_map(|grid| [(grid, 18), (grid, 32)])
+        {
             let maps: Vec<Vec<f32>> = inputs
                 .iter()
                 .enumerate()
@@ -51,7 +54,7 @@ fn parts_added_one_by_one_are_the_whole() {
                 &f64s(&bias),
                 true,
             );
-            assert_close(&format!("{isa} {grid:?}"), &y, &expected);
+            assert_close(&format!("{isa} {grid:?} to {outputs}"), &y, &expected);
         }
     }
 }
@@ -59,7 +62,7 @@ fn parts_added_one_by_one_are_the_whole() {
 #[test]
 fn equals_the_reference_of_the_concatenation_on_every_path() {
     for isa in Isa::available() {
-        for grid in grids() {
+        for grid in grids_and_wide_ones() {
             let cases = vec![
                 (vec![6, 6, 6], 6),
                 (vec![1], 1),

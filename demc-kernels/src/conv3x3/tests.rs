@@ -2,17 +2,20 @@
 
 use super::*;
 use crate::reference;
-use crate::testing::{assert_close, assert_equals_reference, f64s, few, grids, pattern};
+use crate::testing::{
+    assert_close, assert_equals_reference, f64s, few, grids, grids_and_wide_ones, pattern,
+};
 
 #[test]
 fn equals_the_reference_on_every_path_at_odd_sizes() {
     for isa in Isa::available() {
-        for (case, grid) in grids().into_iter().enumerate() {
+        for (case, grid) in grids_and_wide_ones().into_iter().enumerate() {
             let cases = vec![
                 (3, 8),
                 (8, 8),
                 (9, 3),
                 (12, 5),
+                (12, 16),
                 (1, 1),
                 (17, 33),
                 (20, 8),
@@ -47,7 +50,7 @@ fn bands_of_rows_are_the_whole() {
         width: 9,
     };
     for isa in Isa::available() {
-        for (inputs, outputs) in [(3, 20), (20, 3), (18, 33)] {
+        for (inputs, outputs) in [(3, 20), (12, 16), (20, 3), (18, 33)] {
             let (x, weight) = (
                 pattern(grid.pixels() * inputs, 1),
                 pattern(outputs * inputs * 9, 2),

@@ -29,23 +29,28 @@ impl Leaf for Copy<'_> {
         let Copy {
             from_step,
             target_step,
-            channels,
+            mut rows,
+            mut channels,
             ..
         } = self;
+        if (from_step, target_step) == (channels, channels) && self.bias.is_none() {
+            // Rows without gaps are one long row.
+            (rows, channels) = (1, rows * channels);
+        }
         assert!(
-            self.from.len() >= (self.rows - 1) * from_step + channels,
+            self.from.len() >= (rows - 1) * from_step + channels,
             "rows to copy from"
         );
         assert!(
-            self.target.len() >= (self.rows - 1) * target_step + channels,
+            self.target.len() >= (rows - 1) * target_step + channels,
             "rows to copy to"
         );
         assert!(
             self.gate
-                .is_none_or(|gate| gate.len() >= (self.rows - 1) * from_step + channels)
+                .is_none_or(|gate| gate.len() >= (rows - 1) * from_step + channels)
         );
         assert!(self.bias.is_none_or(|bias| bias.len() >= channels));
-        for row in 0..self.rows {
+        for row in 0..rows {
             for channel in (0..channels).step_by(S::LANES) {
                 let n = S::LANES.min(channels - channel);
                 // SAFETY: `n` channels of every row are there, as just checked.
@@ -71,6 +76,45 @@ impl Leaf for Copy<'_> {
             }
         }
     }
+}
+
+/// Adds a bias to rows without gaps and rectifies them, in place.
+struct Finish<'a> {
+    bias: &'a [f32],
+    relu: bool,
+    rows: &'a mut [f32],
+}
+
+impl Leaf for Finish<'_> {
+    type Out = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        let channels = self.bias.len();
+        for row in self.rows.chunks_exact_mut(channels) {
+            for channel in (0..channels).step_by(S::LANES) {
+                let n = S::LANES.min(channels - channel);
+                // SAFETY: the row and the bias have `n` channels there.
+                unsafe {
+                    let place = row.as_mut_ptr().add(channel);
+                    let bias = part::<S>(self.bias.as_ptr().add(channel), n);
+                    let sum = S::add(part::<S>(place, n), bias);
+                    let value = if self.relu { S::relu(sum) } else { sum };
+                    if n == S::LANES {
+                        S::store(place, value)
+                    } else {
+                        S::store_part(place, n, value)
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Adds the bias to rows of as many channels, and rectifies them if `relu`, in place.
+pub(crate) fn finish(isa: Isa, bias: &[f32], relu: bool, rows: &mut [f32]) {
+    // SAFETY: the leaf stays within the rows.
+    unsafe { run(isa, Finish { bias, relu, rows }) }
 }
 
 /// `n` values from `p`.

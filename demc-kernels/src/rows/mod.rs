@@ -15,7 +15,7 @@ use crate::product::{Left, Panels, Right, padded_rows, product};
 use crate::scratch::{Scratch, Shared};
 use crate::simd::{Leaf, Simd, run};
 
-pub(crate) use copy::{Copy, column_sums, copy};
+pub(crate) use copy::{Copy, column_sums, copy, finish};
 pub(crate) use outer::{Outer, PaddedRows, add_outer, outer};
 
 /// Maximum number of rows of a product that are computed at once.
@@ -116,6 +116,12 @@ impl Packed {
     pub(crate) fn values(&mut self) -> Shared {
         Shared::new(&mut self.values)
     }
+}
+
+/// Whether a product can be written to `count` rows of this many columns without gaps: it has neither
+/// padded rows nor padded columns.
+pub(crate) fn fits(count: usize, columns: usize) -> bool {
+    padded_rows(count) == count && whole(columns) == columns
 }
 
 /// Rows per block, at most [`BLOCK`], chosen so that there are enough blocks for all threads.

@@ -149,4 +149,31 @@ impl GatedMap<'_> {
             },
         );
     }
+
+    /// The pixels of a line that some output pixels read: those from `first - 1` on, with zeros outside
+    /// the image. `None` is the line above the image.
+    pub(super) fn line(
+        &self,
+        isa: Isa,
+        grid: Grid,
+        image: usize,
+        line: Option<usize>,
+        first: usize,
+        values: &mut [f32],
+    ) {
+        let channels = self.channels;
+        let Some(line) = line.filter(|line| *line < grid.height) else {
+            return values.fill(0.0);
+        };
+        let left = usize::from(first == 0);
+        let end = first + values.len() / channels - 1;
+        let right = end.saturating_sub(grid.width);
+        let (before, inside) = values.split_at_mut(left * channels);
+        let (inside, after) = inside.split_at_mut(inside.len() - right * channels);
+        before.fill(0.0);
+        after.fill(0.0);
+        let start = (image * grid.height + line) * grid.width;
+        let pixels = start + first + left - 1..start + end - right;
+        self.copy(isa, pixels, inside, channels);
+    }
 }

@@ -1,8 +1,8 @@
 //! 3x3 convolutions with few channels on one side (the first and the last of the network), as plain
 //! sums.
 //!
-//! Few inputs: the 3x3 neighbourhood of a pixel becomes a row of `9 * in` values (*im2col*), and
-//! the convolution is one product.
+//! Few inputs: three products, one for each line of the 3x3 neighbourhood. The gradient of the weight
+//! is one product with the whole neighbourhoods as rows of `9 * in` values (*im2col*).
 //!
 //! Few outputs: such a product would leave most lanes of a vector empty. Instead, one product
 //! computes all `9 * out` values that a pixel contributes to its neighbours. These are then
@@ -62,7 +62,9 @@ pub(crate) fn convolve(
     }
 }
 
-/// Convolves by rows of neighbourhoods.
+/// Convolves by lines: the three pixels of a line that an output pixel reads are `3 * in` values side by
+/// side, and those of the next output pixel begin `in` values later. So a line is the left operand of a
+/// product as it is, and the convolution is a sum of three of them.
 #[allow(clippy::too_many_arguments, reason = "as `convolve`")]
 fn spread(
     isa: Isa,
@@ -74,52 +76,59 @@ fn spread(
     epilogue: BiasRelu,
     y: &mut [f32],
 ) {
-    let (depth, columns) = (9 * axes.inputs, axes.outputs);
-    let b = Packed::new(isa, depth, columns, |k, column| {
-        weight[axes.place(k % axes.inputs, column, k / axes.inputs)]
+    let Axes {
+        inputs,
+        outputs: columns,
+        ..
+    } = axes;
+    let weights: [Packed; 3] = std::array::from_fn(|line| {
+        Packed::new(isa, 3 * inputs, columns, |k, column| {
+            weight[axes.place(k % inputs, column, 3 * line + k / inputs)]
+        })
     });
     let wide = whole(columns);
-    y.par_chunks_mut(BLOCK * columns)
-        .enumerate()
-        .for_each(|(task, y)| {
-            let (first, count) = (task * BLOCK, y.len() / columns);
-            let mut a = Scratch::take(padded_rows(count) * depth);
-            let mut c = Scratch::take(padded_rows(count) * wide);
-            let skipped = above * grid.width;
-            source.gather(
-                isa,
-                grid,
-                skipped + first..skipped + first + count,
-                false,
-                &mut a,
-                depth,
-            );
-            rows::sum(
-                isa,
-                count,
-                &[Term {
-                    rows: &a,
-                    step: depth,
-                    weight: &b,
-                }],
-                &mut c,
-                wide,
-            );
-            copy(
-                isa,
-                Copy {
-                    from: &c,
-                    from_step: wide,
-                    gate: None,
-                    bias: epilogue.bias,
-                    relu: epilogue.relu,
-                    target: y,
-                    target_step: columns,
-                    rows: count,
-                    channels: columns,
-                },
-            );
-        });
+    let height = y.len() / (grid.batch * grid.width * columns);
+    let piece = grid.width.div_ceil(grid.width.div_ceil(BLOCK));
+    let rows = y.par_chunks_mut(grid.width * columns).enumerate();
+    rows.for_each(|(row, y)| {
+        let (image, row) = (row / height, above + row % height);
+        // An image's line and the zeros on both sides, with room for whole blocks of rows.
+        let step = (padded_rows(piece) + 2) * inputs;
+        let mut lines = Scratch::take(3 * step);
+        let mut c = Scratch::take(padded_rows(piece) * wide);
+        for (index, y) in y.chunks_mut(piece * columns).enumerate() {
+            let (first, count) = (index * piece, y.len() / columns);
+            for (line, values) in lines.chunks_exact_mut(step).enumerate() {
+                let values = &mut values[..(count + 2) * inputs];
+                source.line(isa, grid, image, (row + line).checked_sub(1), first, values);
+            }
+            let terms: [Term; 3] = std::array::from_fn(|line| Term {
+                rows: &lines[line * step..][..step],
+                step: inputs,
+                weight: &weights[line],
+            });
+            if let Some(bias) = epilogue.bias
+                && rows::fits(count, columns)
+            {
+                rows::sum(isa, count, &terms, y, columns);
+                rows::finish(isa, bias, epilogue.relu, y);
+                continue;
+            }
+            rows::sum(isa, count, &terms, &mut c, wide);
+            let finish = Copy {
+                from: &c,
+                from_step: wide,
+                gate: None,
+                bias: epilogue.bias,
+                relu: epilogue.relu,
+                target: y,
+                target_step: columns,
+                rows: count,
+                channels: columns,
+            };
+            copy(isa, finish);
+        }
+    });
 }
 
 /// Number of stretches of pixels for a gradient. One task sums each stretch; the sums are added in
