@@ -97,8 +97,7 @@ typedef struct DemcModelObject *DemcModel;
 // Reads a model.
 //
 // `path`, in UTF-8: an exported file (.safetensors), a run directory, or a checkpoint directory. The
-// names "quality" (for 4 samples per pixel) and "fast" (for 1 to 256) are models inside the library.
-// NULL is "quality".
+// names "quality" and "fast" are models inside the library. NULL is "quality".
 //
 // Returns NULL on errors: DEMC_ERROR_INVALID_MODEL for a file that cannot be read, is damaged, is no
 // model, or has another format.

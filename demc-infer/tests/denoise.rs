@@ -194,7 +194,7 @@ fn the_bundled_models_are_small() {
     for model in Bundled::ALL {
         let file = format!("../models/{}.safetensors", model.name());
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(file);
-        assert!(fs::metadata(path).expect("a model").len() <= 30_000_000);
+        assert!(fs::metadata(path).expect("a model").len() <= 12_000_000);
     }
 }
 

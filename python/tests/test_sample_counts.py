@@ -1,4 +1,4 @@
-"""Tests of `render/` and of the bundled model `fast` at several numbers of samples per pixel.
+"""Tests of `render/` and of the bundled models at several numbers of samples per pixel.
 
 Skipped without mitsuba, numpy, or OpenEXR, unless DEMC_REQUIRE_MITSUBA=1.
 """
@@ -59,12 +59,13 @@ class SampleCounts(unittest.TestCase):
             scenes = {scene["name"]: scene["spp"] for scene in json.loads(Path(folder, "manifest.json").read_text())["scenes"]}
             self.assertEqual(len(scenes), 3 * len(COUNTS))
             program = ROOT / "target" / "release" / "demc-infer"
-            evaluate = [program, "evaluate", "--model", "fast", "--data", folder, "--json", "-"]
-            scores = subprocess.run([*map(str, evaluate)], check=True, capture_output=True, text=True)
-            for image in json.loads(scores.stdout)["images"]:
-                with self.subTest(scene=image["name"], spp=scenes[image["name"]]):
-                    self.assertLess(image["denoised"]["relmse"], image["noisy"]["relmse"])
-                    self.assertGreater(image["denoised"]["ssim"], image["noisy"]["ssim"])
+            for model in ("quality", "fast"):
+                evaluate = [program, "evaluate", "--model", model, "--data", folder, "--json", "-"]
+                scores = subprocess.run([*map(str, evaluate)], check=True, capture_output=True, text=True)
+                for image in json.loads(scores.stdout)["images"]:
+                    with self.subTest(model=model, scene=image["name"], spp=scenes[image["name"]]):
+                        self.assertLess(image["denoised"]["relmse"], image["noisy"]["relmse"])
+                        self.assertGreater(image["denoised"]["ssim"], image["noisy"]["ssim"])
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ fn encoded(bundle: &Bundle, names: Names, precision: Precision) -> Vec<u8> {
 
 type TensorList = Vec<(String, Dtype, Vec<usize>, Vec<u8>)>;
 
-fn load_error(tensors: &TensorList, header: Option<&str>) -> String {
+fn serialized(tensors: &TensorList, header: Option<&str>) -> Vec<u8> {
     let views = tensors.iter().map(|(name, dtype, shape, bytes)| {
         (
             name,
@@ -30,7 +30,11 @@ fn load_error(tensors: &TensorList, header: Option<&str>) -> String {
         )
     });
     let metadata = header.map(|text| HashMap::from([("demc".to_string(), text.to_string())]));
-    error_of(&safetensors::serialize(views, metadata).expect("bytes"))
+    safetensors::serialize(views, metadata).expect("bytes")
+}
+
+fn load_error(tensors: &TensorList, header: Option<&str>) -> String {
+    error_of(&serialized(tensors, header))
 }
 
 fn error_of(bytes: &[u8]) -> String {
@@ -238,18 +242,21 @@ fn the_bundled_models_load_by_name() {
     assert!(matches!(error, BundleError::Read { .. }), "{error}");
 }
 
-/// The bundled model `quality` was exported by the first edition.
+/// Without demodulation the first edition wrote 0, or no such key.
 #[test]
 fn a_file_of_the_first_edition_loads() {
-    let file = BundleFile::bundled(Bundled::Quality).expect("the bundled model");
-    let normalizer = &file.meta.normalizer;
-    assert_eq!(normalizer.albedo_demodulation_epsilon, Some(0.07));
-    file.into_bundle(&Device::flex()).expect("all tensors");
-    // Without demodulation the first edition wrote 0, or no such key.
-    for text in ["\"demodulate\":0.0,", ""] {
-        let json = serde_json::to_string(&bundle(Variant::Demc).meta).expect("JSON");
-        let json = json.replacen("\"gamma\":2.2,", &format!("\"gamma\":2.2,{text}"), 1);
-        let meta: BundleMeta = serde_json::from_str(&json).expect("a header");
-        assert_eq!(meta.normalizer.albedo_demodulation_epsilon, None);
+    let (tensors, header) = good();
+    for (text, expected) in [
+        ("\"demodulate\":0.07,", Some(0.07)),
+        ("\"demodulate\":0.0,", None),
+        ("", None),
+    ] {
+        let old = header.replacen("\"gamma\":2.2,", &format!("\"gamma\":2.2,{text}"), 1);
+        let dir = tempfile::tempdir().expect("directory");
+        let path = dir.path().join("old.safetensors");
+        fs::write(&path, serialized(&tensors, Some(&old))).expect("written");
+        let bundle = Bundle::load(&path, &Device::flex()).expect("all tensors");
+        let found = bundle.meta.normalizer.albedo_demodulation_epsilon;
+        assert_eq!(found, expected, "{text}");
     }
 }
