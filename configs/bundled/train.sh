@@ -1,6 +1,6 @@
 #!/bin/sh
-# Trains models like the bundled ones: trains the albedo filter, renders the data, cleans references and
-# albedo, trains the two stages of each model, and exports the weights.
+# Trains models like the bundled ones: trains the albedo filter, renders the data, cleans the references,
+# for `quality` also the albedo, trains the two stages of each model, and exports the weights.
 #
 #   configs/bundled/train.sh [--base DIR]
 #   configs/bundled/train.sh --try          2 steps per stage on data/sample, about 1 minute
@@ -55,7 +55,8 @@ render_train() {
         exit 1
     }
     "$python" python/render -o data/bundled/train --preset train --with "$base"
-    "$python" python/tools/references.py --data data/bundled/train -o data/bundled/clean --albedo-filter $filter
+    "$python" python/tools/references.py --data data/bundled/train -o data/bundled/clean
+    "$python" python/tools/references.py --data data/bundled/train -o data/bundled/filtered --albedo-filter $filter
 }
 
 # Trains one stage: train NAME
@@ -76,7 +77,7 @@ if [ -n "$steps" ]; then
     rm -rf runs/bundled-try
     mkdir -p runs/bundled-try/data/bundled
     cd runs/bundled-try
-    for name in clean albedo; do
+    for name in clean filtered albedo; do
         ln -s "$repository/data/sample" "data/bundled/$name"
     done
 else
@@ -89,5 +90,6 @@ demc-infer export --model runs/bundled/albedo -o $filter
 for model in quality fast; do
     train $model-1
     train $model-2
-    demc-infer export --model runs/bundled/$model-2 --albedo-filter $filter --precision f16 -o runs/bundled/$model.safetensors
 done
+demc-infer export --model runs/bundled/quality-2 --albedo-filter $filter --precision f16 -o runs/bundled/quality.safetensors
+demc-infer export --model runs/bundled/fast-2 --precision f16 -o runs/bundled/fast.safetensors
