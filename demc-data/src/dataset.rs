@@ -5,6 +5,7 @@ use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::fmt;
 use std::io;
+use std::num::NonZero;
 use std::path::{Path, PathBuf};
 
 use rand::seq::SliceRandom;
@@ -59,6 +60,8 @@ pub struct Scene {
     pub height: usize,
     /// Expected RelMSE of the reference against a perfect one, if known.
     pub ref_residual_relmse: Option<f64>,
+    /// How often an epoch of training takes its patches.
+    pub repeat: NonZero<u8>,
     /// The other keys of its manifest entry: licences, credits, render
     /// settings, the denoiser of the reference.
     pub other: serde_json::Map<String, serde_json::Value>,
@@ -93,8 +96,14 @@ struct ManifestScene {
     width: usize,
     height: usize,
     ref_residual_relmse: Option<f64>,
+    #[serde(default = "once")]
+    repeat: NonZero<u8>,
     #[serde(flatten)]
     other: serde_json::Map<String, serde_json::Value>,
+}
+
+fn once() -> NonZero<u8> {
+    NonZero::<u8>::MIN
 }
 
 impl Dataset {
@@ -202,6 +211,7 @@ fn parse(root: &Path, text: &str) -> Result<Vec<Scene>, String> {
         width: entry.width,
         height: entry.height,
         ref_residual_relmse: entry.ref_residual_relmse,
+        repeat: entry.repeat,
         other: entry.other,
     };
     Ok(scenes.into_iter().map(scene).collect())

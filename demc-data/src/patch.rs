@@ -31,7 +31,7 @@ pub enum Border {
     Drop,
 }
 
-/// All patches of `scenes`: scene by scene, row by row.
+/// All patches of `scenes`: scene by scene, row by row, and those of a scene as often as it repeats.
 ///
 /// # Errors
 /// [`Error::SceneTooSmall`], naming the first scene that holds no patch.
@@ -57,12 +57,14 @@ pub fn patches(
                 patch: size,
             });
         }
-        for &y in &rows {
-            patches.extend(columns.iter().map(|&x| Patch {
-                scene: index as u32,
-                y,
-                x,
-            }));
+        for _ in 0..scene.repeat.get() {
+            for &y in &rows {
+                patches.extend(columns.iter().map(|&x| Patch {
+                    scene: index as u32,
+                    y,
+                    x,
+                }));
+            }
         }
     }
     Ok(patches)
@@ -129,6 +131,8 @@ impl EpochOrders {
 
 #[cfg(test)]
 mod tests {
+    use std::num::NonZero;
+
     use super::*;
     use crate::Split;
 
@@ -141,6 +145,7 @@ mod tests {
             width,
             height,
             ref_residual_relmse: None,
+            repeat: NonZero::<u8>::MIN,
             other: serde_json::Map::new(),
         }
     }
@@ -181,6 +186,16 @@ mod tests {
                 x: 1152
             }
         );
+    }
+
+    #[test]
+    fn a_repeated_scene_has_its_patches_as_often() {
+        let mut scenes = [scene("few", 256, 128), scene("many", 128, 128)];
+        scenes[1].repeat = NonZero::new(3).expect("not 0");
+        let patches = patches(&scenes, 128, 128, Border::Drop).expect("large enough");
+        let scenes: Vec<u32> = patches.iter().map(|patch| patch.scene).collect();
+        assert_eq!(scenes, [0, 0, 1, 1, 1]);
+        assert!(patches[2..].iter().all(|patch| *patch == patches[2]));
     }
 
     #[test]

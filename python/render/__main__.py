@@ -45,6 +45,8 @@ NEAR, STILL_NEAR = 0.5, 0.15
 
 
 COUNTS = [1, 2, 4, 8, 16, 32, 64, 128, 256]
+REPEATS = {16: 2, 64: 6}
+"""How often an epoch takes the images of at least so many samples per pixel: with --counts, they are few."""
 PRESETS = {
     "train": {"rooms": 680, "stills": 380, "size": 192, "spp": COUNTS, "counts": 3, "traits": 0.25, "seed": 29},
     "heldout": {
@@ -98,6 +100,8 @@ def main() -> None:
                 images = views.photograph(scene, view, (base.seed + view) * 1000, base.budget, [*files], traits)
                 for (channels, facts), file in zip(images, files.values()):
                     place = {"name": file, "split": args.split, "base": base.name, "file": f"{args.split}/{file}.exr"}
+                    if args.counts:
+                        place["repeat"] = max((times for least, times in REPEATS.items() if facts["spp"] >= least), default=1)
                     views.write(folder / f"{file}.exr", channels, place | facts)
                     said.append("RelMSE {noisy_relmse:.2f} at {spp} spp".format(**facts))
                 said = f"{', '.join(said)}, reference {facts['ref_residual_relmse']:.4f} at {facts['ref_spp']} spp"

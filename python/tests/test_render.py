@@ -307,7 +307,7 @@ class Render(unittest.TestCase):
 
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder)
-            ask = ("--preset", "train", "--rooms", 0, "--stills", 4, "--views", 1, "--size", 32, "--ref-spp", 32, "--spp", "1,2,4,8", "--traits", 1)
+            ask = ("--preset", "train", "--rooms", 0, "--stills", 4, "--views", 1, "--size", 32, "--ref-spp", 64, "--spp", "1,2,4,16", "--traits", 1)
             ended = run("-o", out, *ask)
             self.assertEqual(ended.returncode, 0, ended.stderr)
             scenes = json.loads((out / "manifest.json").read_text())["scenes"]
@@ -318,6 +318,7 @@ class Render(unittest.TestCase):
             self.assertGreater(len({tuple(sorted(drawn)) for drawn in counts.values()}), 1)
             self.assertTrue(all(len(drawn) <= len({*drawn}) <= 3 for drawn in counts.values()))
             for scene in scenes:
+                self.assertEqual(scene["repeat"], 2 if scene["spp"] == 16 else 1)
                 self.assertTrue(0.35 <= scene["pixel_filter_sigma"] <= 0.75 and scene["albedo_behind_glass"])
         # The noise of neighbouring pixels is correlated, and the mean stays.
         noise = np.random.default_rng(1).standard_normal((64, 64, 3))
