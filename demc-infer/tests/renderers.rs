@@ -151,8 +151,13 @@ fn origin_and_unit_of_the_positions_hardly_matter() {
         let moves: [(f32, f32); 3] = [(1.0, 1e6), (1e3, 0.0), (1e3, 1e6)];
         for (factor, offset) in moves {
             let ratio = ratio(&bundle, name, reference, 1.0, |frame| {
-                for x in buffer(frame, 1).iter_mut().filter(|x| **x != 0.0) {
-                    *x = *x * factor + offset;
+                let pixels = frame.width * frame.height;
+                let positions = buffer(frame, 1);
+                // A coordinate of a hit may be 0, as on a floor.
+                let is_hit = |i: &usize| (0..3).any(|axis| positions[axis * pixels + i] != 0.0);
+                let hits: Vec<usize> = (0..pixels).filter(is_hit).collect();
+                for place in (0..3).flat_map(|axis| hits.iter().map(move |i| axis * pixels + i)) {
+                    positions[place] = positions[place] * factor + offset;
                 }
             });
             assert!(

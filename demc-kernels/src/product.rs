@@ -149,6 +149,13 @@ unsafe fn block<S: Simd, const R: usize, const V: usize>(
     // SAFETY: the caller's: every place is a value of A, B or C.
     unsafe {
         let mut sums = [[S::zero(); V]; R];
+        if accumulate {
+            for r in 0..R {
+                for v in 0..V {
+                    sums[r][v] = S::load(c.add(r * c_step + v * S::LANES));
+                }
+            }
+        }
         let (mut a_k, mut b_k) = (a.start, b);
         for _ in 0..depth {
             let mut columns = [S::zero(); V];
@@ -166,12 +173,7 @@ unsafe fn block<S: Simd, const R: usize, const V: usize>(
         }
         for r in 0..R {
             for v in 0..V {
-                let place = c.add(r * c_step + v * S::LANES);
-                let sum = match accumulate {
-                    true => S::add(S::load(place), sums[r][v]),
-                    false => sums[r][v],
-                };
-                S::store(place, sum);
+                S::store(c.add(r * c_step + v * S::LANES), sums[r][v]);
             }
         }
     }

@@ -6,6 +6,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use demc_data::frame::TEXTURES;
 use demc_data::transform::exposure_scale;
 use demc_data::{FEATURES, Frame, PositionMap};
+use demc_model::Head;
 use demc_model::config::COLOR_CHANNELS;
 use demc_model::inference::Cancelled;
 use rayon::prelude::*;
@@ -147,8 +148,8 @@ impl<'a> FrameInput<'a> {
         }
     }
 
-    /// The denoised alpha: where it varies, the mean of the rendered one and of the network's image of
-    /// it. `None` for an image without alpha, or where it varies nowhere.
+    /// The denoised alpha: where it varies, the network's image of it, without a kernel head the mean of
+    /// that and the rendered one. `None` for an image without alpha, or where it varies nowhere.
     ///
     /// # Shapes
     /// Returns `[H, W]`, from 0 to 1.
@@ -176,6 +177,12 @@ impl<'a> FrameInput<'a> {
             observer(DenoiseProgress { share, ..progress })
         })?;
         let pixels = alpha.len();
+        // On one image of Cycles, this took 0.79 of the noisy alpha's squared error to 0.65 with the kernel
+        // head of `quality`; a grey head's image alone was worse than the mean.
+        let share = match self.bundle.meta.model.head {
+            Head::Kernel => 1.0,
+            _ => 0.5,
+        };
         let denoised = alpha
             .iter()
             .enumerate()
@@ -184,7 +191,7 @@ impl<'a> FrameInput<'a> {
                 true => {
                     let channels = (0..COLOR_CHANNELS).map(|channel| image[channel * pixels + i]);
                     let mean = channels.sum::<f32>() / COLOR_CHANNELS as f32;
-                    (rendered + mean.clamp(0.0, 1.0)) / 2.0
+                    (1.0 - share) * rendered + share * mean.clamp(0.0, 1.0)
                 }
             });
         Ok(Some(denoised.collect()))
