@@ -73,9 +73,9 @@ fn verify_accepts_onnx_runtime_and_rejects_another_model() {
         );
         assert!(found.deviations.iter().all(|d| d.passes()), "{found:?}");
     }
-    // An error of a hundredth of a standard deviation in one statistic is detected.
+    // An error of a hundredth of a standard deviation in one statistic is detected (red of the albedo).
     let mut other = bundle;
-    other.meta.normalizer.features.mean[3] += 0.01 * other.meta.normalizer.features.std[3];
+    other.meta.normalizer.features.mean[6] += 0.01 * other.meta.normalizer.features.std[6];
     let found = verify(&path, Runtime::OnnxRuntime, python.path(), &other).expect("run");
     assert!(!found.deviations.iter().any(|d| d.passes()), "{found:?}");
 }
