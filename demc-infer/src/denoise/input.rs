@@ -177,8 +177,8 @@ impl<'a> FrameInput<'a> {
             observer(DenoiseProgress { share, ..progress })
         })?;
         let pixels = alpha.len();
-        // On one image of Cycles, this took 0.79 of the noisy alpha's squared error to 0.65 with the kernel
-        // head of `quality`; a grey head's image alone was worse than the mean.
+        // Squared error on one image of Cycles, relative to the noisy alpha: 0.65 instead of 0.79 with the
+        // kernel head of `quality`. A grey head's image alone had 1.34, the mean 0.66.
         let share = match self.bundle.meta.model.head {
             Head::Kernel => 1.0,
             _ => 0.5,

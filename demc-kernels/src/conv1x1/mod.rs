@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use crate::product::padded_rows;
-use crate::rows::{self, BLOCK, Copy, Outer, Packed, PaddedRows, Term, copy, finish, whole};
+use crate::rows::{self, BLOCK, Copy, Outer, Packed, PaddedRows, Term, copy, whole};
 use crate::scratch::Scratch;
 use crate::{Grid, Isa};
 
@@ -117,7 +117,6 @@ fn products(
     y: &mut [f32],
 ) {
     let outputs = weights[0].columns();
-    let wide = whole(outputs);
     y.par_chunks_mut(BLOCK * outputs)
         .enumerate()
         .for_each(|(task, y)| {
@@ -137,50 +136,8 @@ fn products(
                     weight,
                 })
                 .collect();
-            let add = if epilogue.add {
-                rows::add_sum
-            } else {
-                rows::sum
-            };
-            if rows::fits(count, outputs) && (epilogue.bias.is_some() || !epilogue.relu) {
-                add(isa, count, &terms, y, outputs);
-                if let Some(bias) = epilogue.bias {
-                    finish(isa, bias, epilogue.relu, y);
-                }
-                return;
-            }
-            let mut c = Scratch::take(padded_rows(count) * wide);
-            if epilogue.add {
-                copy(
-                    isa,
-                    Copy {
-                        from: y,
-                        from_step: outputs,
-                        gate: None,
-                        bias: None,
-                        relu: false,
-                        target: &mut c,
-                        target_step: wide,
-                        rows: count,
-                        channels: outputs,
-                    },
-                );
-            }
-            add(isa, count, &terms, &mut c, wide);
-            copy(
-                isa,
-                Copy {
-                    from: &c,
-                    from_step: wide,
-                    gate: None,
-                    bias: epilogue.bias,
-                    relu: epilogue.relu,
-                    target: y,
-                    target_step: outputs,
-                    rows: count,
-                    channels: outputs,
-                },
-            );
+            let Epilogue { bias, relu, add } = epilogue;
+            rows::write_sum(isa, &terms, add, bias, relu, y);
         });
 }
 

@@ -15,7 +15,8 @@ use crate::product::{Left, Panels, Right, padded_rows, product};
 use crate::scratch::{Scratch, Shared};
 use crate::simd::{Leaf, Simd, run};
 
-pub(crate) use copy::{Copy, column_sums, copy, finish};
+use copy::finish;
+pub(crate) use copy::{Copy, column_sums, copy};
 pub(crate) use outer::{Outer, PaddedRows, add_outer, outer};
 
 /// Maximum number of rows of a product that are computed at once.
@@ -118,12 +119,6 @@ impl Packed {
     }
 }
 
-/// Whether a product can be written to `count` rows of this many columns without gaps: it has neither
-/// padded rows nor padded columns.
-pub(crate) fn fits(count: usize, columns: usize) -> bool {
-    padded_rows(count) == count && whole(columns) == columns
-}
-
 /// Rows per block, at most [`BLOCK`], chosen so that there are enough blocks for all threads.
 pub(crate) fn block_rows(rows: usize) -> usize {
     let blocks = rows
@@ -221,4 +216,63 @@ pub(crate) fn add_sum(isa: Isa, count: usize, terms: &[Term], c: &mut [f32], c_s
             },
         )
     }
+}
+
+/// Writes the sum of the terms to `y`, rows without gaps, or adds it if `add`. Then adds the bias and
+/// rectifies if `relu`.
+///
+/// # Panics
+/// If a slice of a term is shorter than [`padded_rows`] of the rows of `y` requires.
+pub(crate) fn write_sum(
+    isa: Isa,
+    terms: &[Term],
+    add: bool,
+    bias: Option<&[f32]>,
+    relu: bool,
+    y: &mut [f32],
+) {
+    let columns = terms[0].weight.columns();
+    let (count, wide) = (y.len() / columns, whole(columns));
+    let write = if add { add_sum } else { sum };
+    // Without padded rows and columns, the product needs no room of its own.
+    let fits = padded_rows(count) == count && wide == columns;
+    if fits && (bias.is_some() || !relu) {
+        write(isa, count, terms, y, columns);
+        if let Some(bias) = bias {
+            finish(isa, bias, relu, y);
+        }
+        return;
+    }
+    let mut c = Scratch::take(padded_rows(count) * wide);
+    if add {
+        copy(
+            isa,
+            Copy {
+                from: y,
+                from_step: columns,
+                gate: None,
+                bias: None,
+                relu: false,
+                target: &mut c,
+                target_step: wide,
+                rows: count,
+                channels: columns,
+            },
+        );
+    }
+    write(isa, count, terms, &mut c, wide);
+    copy(
+        isa,
+        Copy {
+            from: &c,
+            from_step: wide,
+            gate: None,
+            bias,
+            relu,
+            target: y,
+            target_step: columns,
+            rows: count,
+            channels: columns,
+        },
+    );
 }

@@ -15,7 +15,7 @@ use rayon::prelude::*;
 
 use super::parts::{Axes, BiasRelu, GatedMap};
 use crate::product::padded_rows;
-use crate::rows::{self, BLOCK, Copy, Outer, Packed, Term, copy, whole};
+use crate::rows::{self, BLOCK, Outer, Packed, Term, whole};
 use crate::scratch::Scratch;
 use crate::{Grid, Isa};
 use collect::collect;
@@ -62,9 +62,9 @@ pub(crate) fn convolve(
     }
 }
 
-/// Convolves by lines: the three pixels of a line that an output pixel reads are `3 * in` values side by
-/// side, and those of the next output pixel begin `in` values later. So a line is the left operand of a
-/// product as it is, and the convolution is a sum of three of them.
+/// Convolves by lines. An output pixel reads three pixels of a line: `3 * in` values side by side. Those of
+/// the next output pixel begin `in` values later. So a line is the left operand of a product as it is, and
+/// the convolution is a sum of three of them.
 #[allow(clippy::too_many_arguments, reason = "as `convolve`")]
 fn spread(
     isa: Isa,
@@ -86,7 +86,6 @@ fn spread(
             weight[axes.place(k % inputs, column, 3 * line + k / inputs)]
         })
     });
-    let wide = whole(columns);
     let height = y.len() / (grid.batch * grid.width * columns);
     let piece = grid.width.div_ceil(grid.width.div_ceil(BLOCK));
     let rows = y.par_chunks_mut(grid.width * columns).enumerate();
@@ -95,7 +94,6 @@ fn spread(
         // An image's line and the zeros on both sides, with room for whole blocks of rows.
         let step = (padded_rows(piece) + 2) * inputs;
         let mut lines = Scratch::take(3 * step);
-        let mut c = Scratch::take(padded_rows(piece) * wide);
         for (index, y) in y.chunks_mut(piece * columns).enumerate() {
             let (first, count) = (index * piece, y.len() / columns);
             for (line, values) in lines.chunks_exact_mut(step).enumerate() {
@@ -107,26 +105,7 @@ fn spread(
                 step: inputs,
                 weight: &weights[line],
             });
-            if let Some(bias) = epilogue.bias
-                && rows::fits(count, columns)
-            {
-                rows::sum(isa, count, &terms, y, columns);
-                rows::finish(isa, bias, epilogue.relu, y);
-                continue;
-            }
-            rows::sum(isa, count, &terms, &mut c, wide);
-            let finish = Copy {
-                from: &c,
-                from_step: wide,
-                gate: None,
-                bias: epilogue.bias,
-                relu: epilogue.relu,
-                target: y,
-                target_step: columns,
-                rows: count,
-                channels: columns,
-            };
-            copy(isa, finish);
+            rows::write_sum(isa, &terms, false, epilogue.bias, epilogue.relu, y);
         }
     });
 }
