@@ -1,6 +1,6 @@
 #!/bin/sh
 # Trains models like the bundled ones: trains the albedo filter, renders the data, cleans the references,
-# for `quality` also the albedo, trains the two stages of each model, and exports the weights.
+# for `quality` also the albedo, trains the stages of each model, and exports the weights.
 #
 #   configs/bundled/train.sh [--base DIR]
 #   configs/bundled/train.sh --try          2 steps per stage on data/sample, about 1 minute
@@ -87,9 +87,8 @@ train albedo
 demc-infer export --model runs/bundled/albedo -o $filter
 
 [ -n "$steps" ] || render_train
-for model in quality fast; do
-    train $model-1
-    train $model-2
+for stage in quality-1 quality-2 quality-3 fast-1 fast-2; do
+    train $stage
 done
-demc-infer export --model runs/bundled/quality-2 --albedo-filter $filter --precision f16 -o runs/bundled/quality.safetensors
+demc-infer export --model runs/bundled/quality-3 --albedo-filter $filter --precision f16 -o runs/bundled/quality.safetensors
 demc-infer export --model runs/bundled/fast-2 --precision f16 -o runs/bundled/fast.safetensors
