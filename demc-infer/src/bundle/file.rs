@@ -47,13 +47,13 @@ pub struct BundleFile {
     pub albedo_filter: Option<Box<BundleFile>>,
 }
 
-/// A model that is inside the program. `models/README.md` describes them.
+/// A model for 1 to 256 samples per pixel that is inside the program. `models/README.md` describes them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Bundled {
-    /// For 4 samples per pixel: the smaller error there.
+    /// The smaller error.
     #[default]
     Quality,
-    /// For 1 to 256 samples per pixel, in half the time. Takes layers.
+    /// Less than half the time.
     Fast,
 }
 

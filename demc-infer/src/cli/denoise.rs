@@ -58,7 +58,7 @@ fn cache_bytes() -> usize {
   demc-infer denoise --model demc.safetensors renders/ -o denoised/
   demc-infer denoise 'shot.####.exr' --frames 1-10,15,20-40x2 -o denoised/
   demc-infer denoise 'shot.####.exr' --shard 3/8 -o denoised/
-  demc-infer denoise --model fast shot.exr --layers 'ViewLayer.Combined_*' -o clean.exr")]
+  demc-infer denoise shot.exr --layers 'ViewLayer.Combined_*' -o clean.exr")]
 pub struct Arguments {
     #[command(flatten)]
     model: ModelFlag,
