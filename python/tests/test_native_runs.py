@@ -22,7 +22,9 @@ CONFIG = ROOT / "configs" / "quickstart.toml"
 OVERRIDES = {"train.steps": 6, "run.validate_every": 3, "run.checkpoint_every": 3, "data.root": SAMPLE, "data.batch_size": 1}
 """A run of some seconds."""
 SCRIPT = """
-import demc, sys
+import demc, signal, sys
+# A shell's background jobs ignore it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 def on_step(taken):
     print(taken.step, flush=True)
 try:
