@@ -4,7 +4,7 @@
 //! batches.
 
 use crate::augment::{Augment, Variation};
-use crate::cache::{CacheUsage, SceneCache};
+use crate::cache::{AlbedoFilter, CacheUsage, SceneCache};
 use crate::dropout::{Dropout, drop_buffers};
 use crate::frame::{FEATURES, FramePlanes, TEXTURES};
 use crate::patch::{EpochOrders, Patch, patches};
@@ -124,6 +124,12 @@ impl PatchSource {
             workers: config.workers,
             seed,
         })
+    }
+
+    /// The same source, whose scenes have the albedo that `filter` returns.
+    pub fn with_albedo_filter(mut self, filter: AlbedoFilter) -> Self {
+        self.cache = self.cache.with_albedo_filter(filter);
+        self
     }
 
     /// The patches of one epoch, in grid order.

@@ -4,11 +4,17 @@
 //! budget holds.
 
 use std::collections::HashMap;
+use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::dataset::size_mismatch;
-use crate::frame::{FramePlanes, Presence};
+use crate::frame::{Frame, FramePlanes, Presence, TEXTURES};
+use crate::plane::Plane;
 use crate::{ChannelLayout, Error, Preparation, Scene};
+
+/// Returns the filtered albedo of the first hit, planar `[3, H, W]`, or `None` to keep that of the
+/// frame. The error is one line without the scene's name.
+pub type AlbedoFilter = Arc<dyn Fn(&Frame) -> Result<Option<Vec<f32>>, String> + Send + Sync>;
 
 /// The scenes of a training run, decoded on demand and prepared: colour, features and reference, no
 /// mask.
@@ -16,6 +22,7 @@ pub struct SceneCache {
     scenes: Vec<Scene>,
     layout: ChannelLayout,
     preparation: Preparation,
+    albedo_filter: Option<AlbedoFilter>,
     budget: usize,
     turns: Vec<Mutex<()>>,
     kept: Mutex<CachedScenes>,
@@ -58,10 +65,17 @@ impl SceneCache {
             scenes,
             layout,
             preparation,
+            albedo_filter: None,
             budget,
             turns,
             kept: Mutex::default(),
         }
+    }
+
+    /// The same cache, whose scenes have the albedo that `filter` returns.
+    pub fn with_albedo_filter(mut self, filter: AlbedoFilter) -> Self {
+        self.albedo_filter = Some(filter);
+        self
     }
 
     /// The scenes of this cache.
@@ -73,7 +87,7 @@ impl SceneCache {
     /// scenes in parallel and the same scene once.
     ///
     /// # Errors
-    /// As [`crate::read_frame`]; also [`Error::SceneSize`]. A failed scene is not cached, so the
+    /// As [`crate::read_frame`]; also [`Error::SceneSize`] and [`Error::AlbedoFilter`]. A failed scene is not cached, so the
     /// next call tries again.
     ///
     /// # Panics
@@ -92,6 +106,9 @@ impl SceneCache {
         )?;
         if let Some(error) = size_mismatch(scene, planes.width, planes.height) {
             return Err(error);
+        }
+        if let Some(filter) = &self.albedo_filter {
+            filter_albedo(&mut planes, &scene.path, filter)?;
         }
         planes.exposure_scale = self.preparation.apply(&mut planes);
         let planes = Arc::new(planes);
@@ -145,6 +162,34 @@ impl CachedScenes {
             },
         );
     }
+}
+
+fn filter_albedo(
+    planes: &mut FramePlanes,
+    path: &Path,
+    filter: &AlbedoFilter,
+) -> Result<(), Error> {
+    let samples = |planes: &[Plane]| planes.iter().flat_map(Plane::to_f32).collect();
+    let frame = Frame::new(
+        path.display().to_string(),
+        planes.width,
+        planes.height,
+        samples(&planes.color),
+        samples(&planes.features),
+    );
+    let filtered = filter(&frame).map_err(|detail| Error::AlbedoFilter {
+        path: path.to_owned(),
+        detail,
+    })?;
+    let albedo = planes.features[TEXTURES..].iter_mut();
+    let filtered = filtered.iter().flat_map(|filtered| {
+        let pixels = planes.width * planes.height;
+        filtered.chunks_exact(pixels)
+    });
+    for (plane, filtered) in albedo.zip(filtered) {
+        *plane = Plane::Float(filtered.to_vec());
+    }
+    Ok(())
 }
 
 /// A panic cannot leave inconsistent state behind these locks.

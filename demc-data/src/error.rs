@@ -91,6 +91,9 @@ pub enum Error {
         found: String,
         expected: String,
     },
+    /// The albedo filter of a training run failed.
+    #[error("{}: albedo filter: {detail}", path.display())]
+    AlbedoFilter { path: PathBuf, detail: String },
     /// A scene too small for one patch.
     #[error("scene {scene}: {width}x{height} pixels hold no patch of {patch}x{patch}")]
     SceneTooSmall {

@@ -6,11 +6,11 @@ use std::collections::HashSet;
 use std::fs;
 use std::sync::Arc;
 
-use demc_data::cache::SceneCache;
+use demc_data::cache::{AlbedoFilter, SceneCache};
 use demc_data::frame::TEXTURES;
 use demc_data::{
-    Augment, Batch, BatchLoader, Border, DataConfig, Error, FEATURES, Normalizer, PatchSource,
-    Scene, Statistics, read_frame,
+    Augment, Batch, BatchLoader, Border, DataConfig, Error, FEATURES, Frame, Normalizer,
+    PatchSource, Scene, Statistics, read_frame,
 };
 use demc_data::{PositionSpace, Preparation};
 use support::batches::{small, source, train_scenes};
@@ -146,6 +146,64 @@ fn a_demodulated_batch_times_its_modulation_is_the_plain_one() {
     }
     assert_eq!(found.features_z, plain.features_z);
     assert_eq!(found.reference_hdr, plain.reference_hdr);
+}
+
+/// The filter sees the scene as in its file, and its output replaces the albedo of the first hit alone.
+#[test]
+fn a_filtered_albedo_is_that_of_the_batches() {
+    let pixels = 64 * 64;
+    let source = |scenes: Vec<Scene>, filter: Option<AlbedoFilter>| {
+        let config = DataConfig {
+            // It pairs pixels of similar albedo.
+            augment: Augment {
+                noise: false,
+                ..Augment::ALL
+            },
+            position: PositionSpace::Image,
+            ..small()
+        };
+        let source = PatchSource::new(&config, scenes, layout(), identity(), 7).expect("sound");
+        match filter {
+            Some(filter) => source.with_albedo_filter(filter),
+            None => source,
+        }
+    };
+    let frames: Vec<Frame> = train_scenes()
+        .iter()
+        .map(|scene| read_frame(&scene.path, &layout()).expect("sound"))
+        .collect();
+    let half: AlbedoFilter = Arc::new(move |found| {
+        let size = found.width * found.height;
+        let same =
+            |frame: &&Frame| (&frame.color, &frame.features) == (&found.color, &found.features);
+        assert!(frames.iter().find(same).is_some(), "{}", found.name);
+        let albedo = found.features[TEXTURES * size..][..3 * size].iter();
+        Ok(Some(albedo.map(|value| value / 2.0).collect()))
+    });
+    let batch = |filter| source(train_scenes(), filter).batch(1).expect("sound");
+    let (plain, kept, found) = (
+        batch(None),
+        batch(Some(Arc::new(|_: &Frame| Ok(None)))),
+        batch(Some(half)),
+    );
+    assert_eq!(kept, plain);
+    let mut expected = plain;
+    for patch in expected.features_z.chunks_exact_mut(FEATURES * pixels) {
+        let albedo = patch[TEXTURES * pixels..][..3 * pixels].iter_mut();
+        albedo.for_each(|value| *value /= 2.0);
+    }
+    assert_eq!(found, expected);
+
+    let fails: AlbedoFilter = Arc::new(|_| Err("no memory".to_owned()));
+    let scene = train_scenes().remove(0);
+    let path = scene.path.display().to_string();
+    let error = source(vec![scene], Some(fails))
+        .batch(0)
+        .expect_err("it fails");
+    assert_eq!(
+        error.to_string(),
+        format!("{path}: albedo filter: no memory")
+    );
 }
 
 #[test]

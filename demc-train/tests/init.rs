@@ -145,11 +145,13 @@ fn the_albedo_filter_of_the_first_run_is_kept() {
         assert_eq!(found.meta, filter.meta, "{file}");
         assert_eq!(found.model.weights(), filter.model.weights(), "{file}");
     }
-    // Validation uses it.
+    // Training and validation use it.
     let init_plain = format!("train.init={}", first.display());
     trained(&config, &plain, &["--set", &init_plain]);
     let validated = |run: &Path| metrics(run)[1]["valid_relmse"].clone();
     assert!(validated(&whole).is_number() && validated(&whole) != validated(&plain));
+    let first_loss = |run: &Path| metrics(run)[0]["loss"].clone();
+    assert!(first_loss(&whole).is_number() && first_loss(&whole) != first_loss(&plain));
 
     // The resumed run needs the initial file no more.
     assert!(kill_after(&config, &broken, &["--set", &init], 2));

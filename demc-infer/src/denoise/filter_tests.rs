@@ -69,6 +69,10 @@ fn the_filters_image_replaces_the_albedo() {
         original.alpha = Some(alpha(width * height));
         let by_hand = filtered_by_hand(&bundle, &original);
         let padding = Padding { height, width };
+        let filter = bundle.albedo_filter.as_ref().expect("a filter");
+        let alone = filter.filtered_albedo(&original).expect("filtered");
+        let expected = padding.crop(albedo(&mut by_hand.clone()));
+        assert_eq!(alone.expect("not constant"), expected, "{width}x{height}");
         for ensemble in [Ensemble::One, Ensemble::Four] {
             let image = |bundle: &Bundle, frame: &Frame| {
                 denoise(bundle, frame, &Tiling::default(), ensemble).expect("denoised")
@@ -129,6 +133,8 @@ fn a_constant_albedo_is_not_filtered() {
         albedo(&mut flat).fill(value);
         let [with, without] = [&bundle, &plain].map(|b| b.denoise(&flat).expect("denoised"));
         assert_eq!(with, without);
+        let filter = bundle.albedo_filter.as_ref().expect("a filter");
+        assert_eq!(filter.filtered_albedo(&flat).expect("constant"), None);
     }
 }
 

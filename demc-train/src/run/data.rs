@@ -15,6 +15,7 @@ use demc_data::{
     BatchLoader, ChannelLayout, DataConfig, Dataset, Dropout, Normalizer, PatchSource, Ranges,
     Scene, Split, Statistics,
 };
+use demc_infer::Bundle;
 use demc_infer::bundle::{BundleMeta, locate};
 use demc_model::ModelConfig;
 use serde::{Deserialize, Serialize};
@@ -192,7 +193,8 @@ impl RunData {
         Ok(())
     }
 
-    /// The source of the training patches. The ranks of a node share `data.cache_mib`.
+    /// The source of the training patches, whose albedo is filtered as validation and denoising
+    /// filter it. The ranks of a node share `data.cache_mib`.
     ///
     /// # Errors
     /// Scenes smaller than a patch.
@@ -200,16 +202,24 @@ impl RunData {
         &self,
         config: &Config,
         on_node: OnNode,
+        albedo_filter: Option<&Bundle>,
     ) -> Result<PatchSource, demc_data::Error> {
         let mut data = config.data.clone();
         data.cache_mib /= on_node.count;
-        PatchSource::new(
+        let source = PatchSource::new(
             &data,
             self.train.clone(),
             self.layout.clone(),
             self.normalizer.clone(),
             config.train.seed,
-        )
+        )?;
+        Ok(match albedo_filter.cloned() {
+            None => source,
+            Some(filter) => source.with_albedo_filter(Arc::new(move |frame| {
+                let filtered = filter.filtered_albedo(frame);
+                filtered.map_err(|error| error.to_string())
+            })),
+        })
     }
 
     /// The description of weights that are trained on this data, at `step`.

@@ -38,7 +38,7 @@ pub struct TrainingRun {
     dir: RunDir,
     source: Arc<PatchSource>,
     trainer: Trainer,
-    /// The albedo filter of `train.init`, in every bundle of the run.
+    /// The albedo filter of `train.init`: of the training scenes, and in every bundle of the run.
     albedo_filter: Option<Box<Bundle>>,
     state: LoopState,
     /// The weights of `train.init`, if the run is new.
@@ -76,7 +76,6 @@ impl TrainingRun {
         ranks: Ranks,
     ) -> anyhow::Result<Self> {
         let device = device.clone().autodiff();
-        let source = data.patch_source(&config, ranks.on_node())?;
         let (model, albedo_filter, average, optimizer, state, initial) = match checkpoint {
             Some(Checkpoint {
                 bundle,
@@ -125,6 +124,7 @@ impl TrainingRun {
                 )
             }
         };
+        let source = data.patch_source(&config, ranks.on_node(), albedo_filter.as_deref())?;
         let trainer = Trainer::new(&config, model, optimizer, average, device).on(ranks.clone());
         Ok(TrainingRun {
             config,

@@ -86,11 +86,14 @@ pub fn sweep(
     mut on_step: impl FnMut(&SweepPoint),
 ) -> anyhow::Result<Sweep> {
     check_memory(config, device, ranks.on_node().count)?;
-    let source = Arc::new(data.patch_source(config, ranks.on_node())?);
+    let device = device.clone().autodiff();
+    let InitialNetwork { albedo_filter, .. } =
+        initial_network(config, data.normalizer.flat_color, &device)?;
+    let source = data.patch_source(config, ranks.on_node(), albedo_filter.as_deref())?;
+    let source = Arc::new(source);
     let per_step = config.train.grad_accumulation;
     let mut loader = rank_loader(source, ranks, per_step, 0);
     let own = ranks.share(per_step);
-    let device = device.clone().autodiff();
     let trainer = || -> anyhow::Result<Trainer> {
         let InitialNetwork { model, .. } =
             initial_network(config, data.normalizer.flat_color, &device)?;
