@@ -4,17 +4,19 @@
 //! budget holds.
 
 use std::collections::HashMap;
+use std::error::Error as StdError;
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::dataset::size_mismatch;
-use crate::frame::{Frame, FramePlanes, Presence, TEXTURES};
+use crate::frame::{Frame, FramePlanes, Presence, TEXTURES, frame_of};
 use crate::plane::Plane;
 use crate::{ChannelLayout, Error, Preparation, Scene};
 
 /// Returns the filtered albedo of the first hit, planar `[3, H, W]`, or `None` to keep that of the
-/// frame. The error is one line without the scene's name.
-pub type AlbedoFilter = Arc<dyn Fn(&Frame) -> Result<Option<Vec<f32>>, String> + Send + Sync>;
+/// frame.
+pub type AlbedoFilter =
+    Arc<dyn Fn(&Frame) -> Result<Option<Vec<f32>>, Box<dyn StdError + Send + Sync>> + Send + Sync>;
 
 /// The scenes of a training run, decoded on demand and prepared: colour, features and reference, no
 /// mask.
@@ -87,8 +89,8 @@ impl SceneCache {
     /// scenes in parallel and the same scene once.
     ///
     /// # Errors
-    /// As [`crate::read_frame`]; also [`Error::SceneSize`] and [`Error::AlbedoFilter`]. A failed scene is not cached, so the
-    /// next call tries again.
+    /// As [`crate::read_frame`]; also [`Error::SceneSize`] and [`Error::AlbedoFilter`]. A failed
+    /// scene is not cached, so the next call tries again.
     ///
     /// # Panics
     /// If `index` is out of range.
@@ -169,24 +171,21 @@ fn filter_albedo(
     path: &Path,
     filter: &AlbedoFilter,
 ) -> Result<(), Error> {
-    let samples = |planes: &[Plane]| planes.iter().flat_map(Plane::to_f32).collect();
-    let frame = Frame::new(
-        path.display().to_string(),
-        planes.width,
-        planes.height,
-        samples(&planes.color),
-        samples(&planes.features),
-    );
-    let filtered = filter(&frame).map_err(|detail| Error::AlbedoFilter {
+    let input = FramePlanes {
+        color: planes.color.clone(),
+        features: planes.features.clone(),
+        reference: None,
+        mask: None,
+        alpha: None,
+        ..*planes
+    };
+    let filtered = filter(&frame_of(input, path)?).map_err(|source| Error::AlbedoFilter {
         path: path.to_owned(),
-        detail,
+        source,
     })?;
+    let filtered = filtered.unwrap_or_default();
     let albedo = planes.features[TEXTURES..].iter_mut();
-    let filtered = filtered.iter().flat_map(|filtered| {
-        let pixels = planes.width * planes.height;
-        filtered.chunks_exact(pixels)
-    });
-    for (plane, filtered) in albedo.zip(filtered) {
+    for (plane, filtered) in albedo.zip(filtered.chunks_exact(planes.width * planes.height)) {
         *plane = Plane::Float(filtered.to_vec());
     }
     Ok(())

@@ -92,8 +92,11 @@ pub enum Error {
         expected: String,
     },
     /// The albedo filter of a training run failed.
-    #[error("{}: albedo filter: {detail}", path.display())]
-    AlbedoFilter { path: PathBuf, detail: String },
+    #[error("{}: albedo filter", path.display())]
+    AlbedoFilter {
+        path: PathBuf,
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
     /// A scene too small for one patch.
     #[error("scene {scene}: {width}x{height} pixels hold no patch of {patch}x{patch}")]
     SceneTooSmall {

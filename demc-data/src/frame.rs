@@ -158,7 +158,7 @@ fn decode<R: Read + Seek>(
     frame_of(planes, file.path())
 }
 
-fn frame_of(planes: FramePlanes, path: &Path) -> Result<Frame, Error> {
+pub(crate) fn frame_of(planes: FramePlanes, path: &Path) -> Result<Frame, Error> {
     let name = path
         .file_stem()
         .unwrap_or_default()

@@ -148,7 +148,7 @@ fn a_demodulated_batch_times_its_modulation_is_the_plain_one() {
     assert_eq!(found.reference_hdr, plain.reference_hdr);
 }
 
-/// The filter sees the scene as in its file, and its output replaces the albedo of the first hit alone.
+/// The filter sees the scene as in its file. Its output replaces the albedo of the first hit alone.
 #[test]
 fn a_filtered_albedo_is_that_of_the_batches() {
     let pixels = 64 * 64;
@@ -194,14 +194,15 @@ fn a_filtered_albedo_is_that_of_the_batches() {
     }
     assert_eq!(found, expected);
 
-    let fails: AlbedoFilter = Arc::new(|_| Err("no memory".to_owned()));
+    let fails: AlbedoFilter = Arc::new(|_| Err("no memory".into()));
     let scene = train_scenes().remove(0);
     let path = scene.path.display().to_string();
     let error = source(vec![scene], Some(fails))
         .batch(0)
         .expect_err("it fails");
+    let cause = std::error::Error::source(&error).expect("what the filter said");
     assert_eq!(
-        error.to_string(),
+        format!("{error}: {cause}"),
         format!("{path}: albedo filter: no memory")
     );
 }

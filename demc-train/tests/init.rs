@@ -4,6 +4,7 @@ mod common;
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use burn::tensor::Device;
 use common::{RESULTS, assert_same_run, config, error_line, kill_after, metrics, train, trained};
@@ -152,6 +153,19 @@ fn the_albedo_filter_of_the_first_run_is_kept() {
     assert!(validated(&whole).is_number() && validated(&whole) != validated(&plain));
     let first_loss = |run: &Path| metrics(run)[0]["loss"].clone();
     assert!(first_loss(&whole).is_number() && first_loss(&whole) != first_loss(&plain));
+
+    // So does find-lr.
+    let swept = |init: &str| {
+        let out = path("sweep");
+        let sweep = Command::new(env!("CARGO_BIN_EXE_demc-train"))
+            .args(["find-lr", "--steps", "10", "--set", init, "--config"])
+            .args([&config, Path::new("--out"), &out])
+            .output();
+        assert!(sweep.expect("it starts").status.success());
+        fs::read(out.with_extension("csv")).expect("a table")
+    };
+    assert_ne!(swept(&init), swept(&init_plain));
+    assert_eq!(swept(&init), swept(&init));
 
     // The resumed run needs the initial file no more.
     assert!(kill_after(&config, &broken, &["--set", &init], 2));

@@ -47,7 +47,8 @@ pub struct BundleFile {
     pub albedo_filter: Option<Box<BundleFile>>,
 }
 
-/// A model for 1 to 256 samples per pixel that is inside the program. `models/README.md` describes them.
+/// A model for 1 to 256 samples per pixel that is inside the program. `models/README.md` describes
+/// them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Bundled {
     /// The smaller error.

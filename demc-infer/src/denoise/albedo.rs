@@ -6,9 +6,9 @@
 
 use std::sync::Arc;
 
+use demc_data::Frame;
 use demc_data::frame::TEXTURES;
 use demc_data::transform::MAX_ALBEDO;
-use demc_data::{Frame, PositionMap};
 use demc_model::config::COLOR_CHANNELS;
 use rayon::prelude::*;
 
@@ -31,12 +31,57 @@ impl FrameInput<'_> {
         observer: &mut DenoiseObserver,
     ) -> Result<(), DenoiseError> {
         if let Some(filter) = &self.bundle.albedo_filter {
-            // The filter takes the positions of the network ([`BundleMeta::filter_problem`]).
-            let (positions, size) = (self.positions, self.padded());
-            let filtered = filtered(filter, self.frame, positions, size, tiling, observer)?;
+            let filtered = self.filtered(filter, self.padded(), tiling, observer)?;
             self.albedo = filtered.map(Arc::from);
         }
         Ok(())
+    }
+
+    /// The filter's image of the albedo, cropped or padded to `size`; `None` for a constant albedo.
+    fn filtered(
+        &self,
+        filter: &Bundle,
+        size: Padding,
+        tiling: &Tiling,
+        observer: &mut DenoiseObserver,
+    ) -> Result<Option<Vec<f32>>, DenoiseError> {
+        let frame = self.frame;
+        let pixels = frame.width * frame.height;
+        let albedo = &frame.features[TEXTURES * pixels..][..COLOR_CHANNELS * pixels];
+        let is_constant = |plane: &[f32]| plane.iter().all(|value| *value == plane[0]);
+        if albedo.chunks_exact(pixels).all(is_constant) {
+            return Ok(None);
+        }
+        let clamp = |value: &f32| value.clamp(0.0, MAX_ALBEDO);
+        let color: Vec<f32> = albedo.par_iter().map(clamp).collect();
+        let own = FrameInput {
+            color: &color,
+            // The filter takes the positions of the network ([`BundleMeta::filter_problem`]).
+            ..FrameInput::with_positions(filter, frame, self.positions)?
+        };
+        let tiles = filter.tiles(frame.height, frame.width, &tiling.exact(), Ensemble::One);
+        let tiles = tiles.map_err(|source| DenoiseError::Memory {
+            name: frame.name.clone(),
+            source,
+        })?;
+        let mut filtered = own.denoise_into(size, &tiles, &mut |progress| {
+            let share = 0.0;
+            observer(DenoiseProgress { share, ..progress })
+        })?;
+        let rows = filtered.par_chunks_mut(size.width).enumerate();
+        rows.for_each(|(row, filtered)| {
+            let first = (row % size.height).min(frame.height - 1) * frame.width;
+            let albedo = [0, 1, 2].map(|c| &color[c * pixels + first..][..frame.width]);
+            for (column, value) in filtered.iter_mut().enumerate() {
+                let column = column.min(frame.width - 1);
+                // Without a surface there is nothing to filter; neighbours would bleed in.
+                *value = match albedo.iter().any(|channel| channel[column] > 0.0) {
+                    true => value.min(MAX_ALBEDO),
+                    false => 0.0,
+                };
+            }
+        });
+        Ok(Some(filtered))
     }
 }
 
@@ -52,64 +97,7 @@ impl Bundle {
     /// Buffers of other sizes; no memory for the smallest tile; a failed device; an output that is
     /// not finite.
     pub fn filtered_albedo(&self, frame: &Frame) -> Result<Option<Vec<f32>>, DenoiseError> {
-        let positions = FrameInput::new(self, frame)?.positions;
-        let size = Padding {
-            height: frame.height,
-            width: frame.width,
-        };
-        filtered(
-            self,
-            frame,
-            positions,
-            size,
-            &Tiling::default(),
-            &mut unobserved,
-        )
+        let input = FrameInput::new(self, frame)?;
+        input.filtered(self, input.padding, &Tiling::default(), &mut unobserved)
     }
-}
-
-/// The filter's image of the albedo, cropped or padded to `size`; `None` for a constant albedo.
-fn filtered(
-    filter: &Bundle,
-    frame: &Frame,
-    positions: Option<PositionMap>,
-    size: Padding,
-    tiling: &Tiling,
-    observer: &mut DenoiseObserver,
-) -> Result<Option<Vec<f32>>, DenoiseError> {
-    let pixels = frame.width * frame.height;
-    let albedo = &frame.features[TEXTURES * pixels..][..COLOR_CHANNELS * pixels];
-    let is_constant = |plane: &[f32]| plane.iter().all(|value| *value == plane[0]);
-    if albedo.chunks_exact(pixels).all(is_constant) {
-        return Ok(None);
-    }
-    let clamp = |value: &f32| value.clamp(0.0, MAX_ALBEDO);
-    let color: Vec<f32> = albedo.par_iter().map(clamp).collect();
-    let own = FrameInput {
-        color: &color,
-        ..FrameInput::with_positions(filter, frame, positions)?
-    };
-    let tiles = filter.tiles(frame.height, frame.width, &tiling.exact(), Ensemble::One);
-    let tiles = tiles.map_err(|source| DenoiseError::Memory {
-        name: frame.name.clone(),
-        source,
-    })?;
-    let mut filtered = own.denoise_into(size, &tiles, &mut |progress| {
-        let share = 0.0;
-        observer(DenoiseProgress { share, ..progress })
-    })?;
-    let rows = filtered.par_chunks_mut(size.width).enumerate();
-    rows.for_each(|(row, filtered)| {
-        let first = (row % size.height).min(frame.height - 1) * frame.width;
-        let albedo = [0, 1, 2].map(|c| &color[c * pixels + first..][..frame.width]);
-        for (column, value) in filtered.iter_mut().enumerate() {
-            let column = column.min(frame.width - 1);
-            // Without a surface there is nothing to filter; neighbours would bleed in.
-            *value = match albedo.iter().any(|channel| channel[column] > 0.0) {
-                true => value.min(MAX_ALBEDO),
-                false => 0.0,
-            };
-        }
-    });
-    Ok(Some(filtered))
 }

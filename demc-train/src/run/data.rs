@@ -215,10 +215,9 @@ impl RunData {
         )?;
         Ok(match albedo_filter.cloned() {
             None => source,
-            Some(filter) => source.with_albedo_filter(Arc::new(move |frame| {
-                let filtered = filter.filtered_albedo(frame);
-                filtered.map_err(|error| error.to_string())
-            })),
+            Some(filter) => {
+                source.with_albedo_filter(Arc::new(move |frame| Ok(filter.filtered_albedo(frame)?)))
+            }
         })
     }
 

@@ -87,21 +87,21 @@ pub fn sweep(
 ) -> anyhow::Result<Sweep> {
     check_memory(config, device, ranks.on_node().count)?;
     let device = device.clone().autodiff();
-    let InitialNetwork { albedo_filter, .. } =
-        initial_network(config, data.normalizer.flat_color, &device)?;
+    let network = || initial_network(config, data.normalizer.flat_color, &device);
+    let InitialNetwork {
+        model,
+        albedo_filter,
+        ..
+    } = network()?;
     let source = data.patch_source(config, ranks.on_node(), albedo_filter.as_deref())?;
-    let source = Arc::new(source);
     let per_step = config.train.grad_accumulation;
-    let mut loader = rank_loader(source, ranks, per_step, 0);
+    let mut loader = rank_loader(Arc::new(source), ranks, per_step, 0);
     let own = ranks.share(per_step);
-    let trainer = || -> anyhow::Result<Trainer> {
-        let InitialNetwork { model, .. } =
-            initial_network(config, data.normalizer.flat_color, &device)?;
+    let trainer = |model| {
         let optimizer = Optimizer::new(config);
-        let trainer = Trainer::new(config, model, optimizer, None, device.clone());
-        Ok(trainer.on(ranks.clone()))
+        Trainer::new(config, model, optimizer, None, device.clone()).on(ranks.clone())
     };
-    let (mut trained, untrained) = (trainer()?, trainer()?);
+    let (mut trained, untrained) = (trainer(model), trainer(network()?.model));
     let mut ratios = SweepRatios::default();
     for step in 0..range.steps {
         let batches: Result<Vec<Batch>, demc_data::Error> =
