@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Shell blocks and links of the documentation.
 
-    docs.py list            names of all shell blocks, in the order in which CI runs them
+    docs.py pages           the name of each shell block, and its page
     docs.py show NAME       the commands of one block
-    docs.py check           every shell block has a name of its own; every link and image leads somewhere
+    docs.py check           every shell block has a name of its own and runs in CI; links and images lead somewhere
 
 A shell block is a ```sh fence; the line above it names it: <!-- ci: NAME -->
 """
@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-# CI runs the blocks of these pages, in this order: a block may use what an earlier one made.
+# CI runs the blocks of these pages.
 PAGES = ["README.md", *(f"docs/{page}.md" for page in (
     "training", "configuration", "data", "denoising", "farms", "clusters", "renderers", "evaluation", "export", "devices", "performance", "network",
     "experiments", "install", "python", "c-library", "dependencies")), "python/README.md", "models/README.md", "integrations/blender/README.md"]
@@ -66,7 +66,7 @@ def anchors(path):
 
 def problems():
     """Everything that is wrong, one line each."""
-    names = {}
+    names, sections = {}, (ROOT / ".ci/sections.toml").read_text()
     for page in markdown():
         for line, name, _ in blocks(page):
             if page not in PAGES:
@@ -77,6 +77,8 @@ def problems():
                 yield f"{page}:{line}: the block {name} stands in {names[name]} already"
             else:
                 names[name] = page
+                if not re.search(rf"\bblock {name}(?![a-z0-9-])", sections):
+                    yield f"{page}:{line}: no section of .ci/sections.toml runs the block {name}"
         for link in LINK.findall(prose((ROOT / page).read_text())):
             if re.match(r"[a-z]+:", link):
                 continue
@@ -94,8 +96,8 @@ def main(arguments):
     pages = [page for page in PAGES if (ROOT / page).exists()]
     named = {name: commands for page in pages for _, name, commands in blocks(page)}
     match arguments:
-        case ["list"]:
-            print(*(name for name in named if name), sep="\n")
+        case ["pages"]:
+            print(*(f"{name} {page}" for page in pages for _, name, _ in blocks(page) if name), sep="\n")
         case ["show", name] if name in named:
             print(named[name], end="")
         case ["check"]:

@@ -30,8 +30,8 @@ pack() {
     local to=$1 features=${2-wgpu,cuda} built
     cd "$ROOT"
     cargo build --release -p demc-bench --features "$features"
-    built=$(cargo test --release -p demc-tests --features "$features" --test parity --no-run --message-format=json |
-        grep -o '"executable":"[^"]*/parity-[^"]*"' | tail -1 | cut -d'"' -f4)
+    built=$(cargo test --release -p demc-tests --features "$features" --test suite --no-run --message-format=json |
+        grep -o '"executable":"[^"]*/suite-[^"]*"' | tail -1 | cut -d'"' -f4)
     [ -x "$built" ] || fail "the parity test was not built"
     mkdir -p "$to"/{benches/results,python,target/release,tests/parity}
     cp -r benches/gpu.sh benches/peers "$to/benches/"
@@ -56,7 +56,7 @@ bad() { touch "$WORK/bad"; }
 parity() {
     local log=$WORK/parity.log
     echo; echo "### Parity with the PyTorch fixtures"; echo
-    if DEMC_DEVICE=$1 DEMC_FIXTURES=$ROOT/tests/parity/fixtures "$PARITY" >"$log" 2>&1; then
+    if DEMC_DEVICE=$1 DEMC_FIXTURES=$ROOT/tests/parity/fixtures "$PARITY" parity:: >"$log" 2>&1; then
         grep '^test result' "$log"
     else
         bad

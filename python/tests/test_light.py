@@ -1,4 +1,4 @@
-"""Tests of `demc.torch.light`. `tests/tests/python_live.rs` compares it with `demc-infer`."""
+"""Tests of `demc.torch.light`. `tests/tests/suite/python_live.rs` compares it with `demc-infer`."""
 
 import importlib.util
 import unittest

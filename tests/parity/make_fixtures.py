@@ -30,7 +30,7 @@ SHAPE = (2, 64, 64)  # batch, height, width: the latent is 2 x 2, the smallest s
 SEEDS = {"grey": 0, "kernel": 2}  # found by trial, because the checks reject some seeds
 STEPS, LEARNING_RATE = 5, 1e-3
 MARGIN = 0.2  # share of the Rust tests' tolerances that float32 rounding may use up
-OUTPUT_TOLERANCE = 1e-5  # of the largest value; these three are those of tests/tests/parity/
+OUTPUT_TOLERANCE = 1e-5  # of the largest value; these three are those of tests/tests/suite/parity/
 GRADIENT_TOLERANCE = (2e-5, 1e-4)  # of the tensor's largest value, and of the value itself
 ADAM_TOLERANCE = 0.02  # of the path of a weight whose gradient keeps its sign, STEPS * LEARNING_RATE
 

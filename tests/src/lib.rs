@@ -1,1 +1,1 @@
-//! Tests across the crates, in `tests/tests/`: parity with PyTorch, backends, metrics and exports.
+//! Tests across the crates, in `tests/tests/suite`: parity with PyTorch, backends, metrics and exports.

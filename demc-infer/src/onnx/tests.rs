@@ -1,4 +1,4 @@
-//! Tests of the graph without a runtime; `tests/tests/onnx_live.rs` runs it in one.
+//! Tests of the graph without a runtime; `tests/tests/suite/onnx_live.rs` runs it in one.
 
 use std::collections::HashSet;
 

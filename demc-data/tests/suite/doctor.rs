@@ -1,0 +1,336 @@
+//! Damaged copies of sample scenes, and what `demc_data::doctor` finds in them.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+use crate::support::{sample, write};
+use demc_data::doctor::{Report, examine};
+use demc_data::exr::ExrFile;
+use exr::prelude::FlatSamples;
+use serde_json::{Value, json};
+
+const SIDE: usize = 224;
+const PIXELS: usize = SIDE * SIDE;
+const COLOR: [&str; 3] = ["R", "G", "B"];
+const REFERENCE: [&str; 3] = ["ref.R", "ref.G", "ref.B"];
+const NORMAL: [&str; 3] = ["normal.X", "normal.Y", "normal.Z"];
+const POSITION: [&str; 3] = ["position.X", "position.Y", "position.Z"];
+const ALBEDO: [&str; 3] = ["albedo1.R", "albedo1.G", "albedo1.B"];
+
+/// The channels of a scene.
+type Planes = BTreeMap<String, Vec<f32>>;
+
+fn planes(name: &str) -> Planes {
+    let mut file = ExrFile::open(&sample().join(format!("train/{name}.exr"))).expect("a scene");
+    let names: Vec<String> = file.channels().iter().map(|c| c.name.clone()).collect();
+    let read: Vec<&str> = names.iter().map(String::as_str).collect();
+    let planes = file.read(&read).expect("sound");
+    let planes = planes.iter().map(|plane| plane.to_f32());
+    names.iter().cloned().zip(planes).collect()
+}
+
+fn save(path: &Path, planes: Planes) {
+    let channels = planes.into_iter();
+    let channels = channels.map(|(name, samples)| (name, FlatSamples::F32(samples)));
+    write(path, (SIDE, SIDE), channels.collect());
+}
+
+fn entry(name: &str, split: &str) -> Value {
+    let file = format!("{name}.exr");
+    json!({"name": name, "split": split, "base": name, "file": file, "width": SIDE, "height": SIDE})
+}
+
+/// Three scenes: `good` and `bad` for training, `other` for tests.
+struct Set {
+    dir: tempfile::TempDir,
+    scenes: Vec<Value>,
+}
+
+impl Set {
+    fn new() -> Self {
+        let dir = tempfile::tempdir().expect("a temporary directory");
+        for (name, scene) in [
+            ("good", "col-spaceship-0"),
+            ("bad", "gen-room-train-0"),
+            ("other", "gen-table-train-8"),
+        ] {
+            let from = sample().join(format!("train/{scene}.exr"));
+            fs::copy(from, dir.path().join(format!("{name}.exr"))).expect("copied");
+        }
+        let scenes = vec![
+            entry("good", "train"),
+            entry("bad", "train"),
+            entry("other", "test"),
+        ];
+        Self { dir, scenes }
+    }
+
+    /// The set with another `bad`.
+    fn damaged(damage: impl FnOnce(&mut Planes)) -> Self {
+        let set = Self::new();
+        let mut planes = planes("gen-room-train-0");
+        damage(&mut planes);
+        save(&set.path("bad.exr"), planes);
+        set
+    }
+
+    fn path(&self, file: &str) -> std::path::PathBuf {
+        self.dir.path().join(file)
+    }
+
+    fn examine(&self) -> Report {
+        let manifest = json!({"format": "demc-exr 1", "scenes": self.scenes});
+        fs::write(self.path("manifest.json"), manifest.to_string()).expect("writable");
+        examine(self.dir.path(), None, 128).unwrap_or_else(|error| panic!("{error}"))
+    }
+
+    /// Checks that there is one problem, that it starts with `problem`, and that `scene` has it.
+    fn has(&self, problem: &str, scene: &str) -> String {
+        let report = self.examine();
+        let [found] = &report.problems[..] else {
+            panic!("one problem, {problem}: {:#?}", report.problems)
+        };
+        assert!(
+            found.problem.starts_with(problem),
+            "{found:#?}, not {problem}"
+        );
+        assert_eq!(found.scenes[0].scene, scene, "{found:#?}");
+        assert_eq!(found.scenes.len(), 1, "{found:#?}");
+        format!("{}; {}", found.scenes[0].detail, found.cause)
+    }
+}
+
+fn each(planes: &mut Planes, names: [&str; 3], change: impl Fn(f32) -> f32) {
+    for name in names {
+        let plane = planes.get_mut(name).expect("a channel");
+        plane.iter_mut().for_each(|x| *x = change(*x));
+    }
+}
+
+fn copy(planes: &mut Planes, from: [&str; 3], to: [&str; 3]) {
+    for (from, to) in from.into_iter().zip(to) {
+        planes.insert(to.to_owned(), planes[from].clone());
+    }
+}
+
+fn swap(planes: &mut Planes, a: [&str; 3], b: [&str; 3]) {
+    let before = planes.clone();
+    for (a, b) in a.into_iter().zip(b) {
+        planes.insert(a.to_owned(), before[b].clone());
+        planes.insert(b.to_owned(), before[a].clone());
+    }
+}
+
+/// The plane `[a, 1 - 2 a, a]` filtered in both directions.
+fn filtered(plane: &[f32], a: f32) -> Vec<f32> {
+    let at = |x: usize, y: usize| plane[y.min(SIDE - 1) * SIDE + x.min(SIDE - 1)];
+    let across =
+        |x: usize, y| a * (at(x.saturating_sub(1), y) + at(x + 1, y)) + (1.0 - 2.0 * a) * at(x, y);
+    let down = |i: usize| {
+        let (x, y) = (i % SIDE, i / SIDE);
+        a * (across(x, y.saturating_sub(1)) + across(x, y + 1)) + (1.0 - 2.0 * a) * across(x, y)
+    };
+    (0..PIXELS).map(down).collect()
+}
+
+#[test]
+fn the_sample_has_no_problems() {
+    let report = examine(&sample(), None, 128).expect("a data set");
+    assert_eq!((report.scenes, report.layout.as_str()), (14, "demc-exr"));
+    assert_eq!(report.problems, []);
+    assert_eq!(Set::new().examine().problems, []);
+}
+
+#[test]
+fn a_wide_pixel_filter_shows_in_the_noise() {
+    let set = Set::damaged(|planes| {
+        for name in COLOR {
+            let plane = filtered(&planes[name], 0.14);
+            planes.insert(name.to_owned(), plane);
+        }
+    });
+    let found = set.has("noise of neighbouring pixels correlates", "bad");
+    assert!(found.contains("by 0.") && found.contains("box"), "{found}");
+}
+
+#[test]
+fn references_that_do_not_match_are_told_apart() {
+    let set = Set::damaged(|planes| each(planes, REFERENCE, |x| 2.0 * x));
+    let found = set.has("the reference has another exposure", "bad");
+    assert!(found.starts_with("1.0 stops brighter"), "{found}");
+
+    for (x, y) in [(1, 0), (0, 1), (2, 2)] {
+        let set = Set::damaged(|planes| {
+            for name in REFERENCE {
+                let before = planes[name].clone();
+                let from = |i: usize| {
+                    let (column, row) = (i % SIDE, i / SIDE);
+                    before[row.saturating_sub(y) * SIDE + column.saturating_sub(x)]
+                };
+                planes.insert(name.to_owned(), (0..PIXELS).map(from).collect());
+            }
+        });
+        let found = set.has("the reference is shifted", "bad");
+        assert!(
+            found.starts_with(&format!("by +{x} +{y} pixels")),
+            "{found}"
+        );
+    }
+
+    let set = Set::damaged(|bad| {
+        let other = planes("gen-room-train-12");
+        for name in REFERENCE {
+            bad.insert(name.to_owned(), other[name].clone());
+        }
+    });
+    set.has("the reference shows another image", "bad");
+
+    let set = Set::damaged(|planes| copy(planes, COLOR, REFERENCE));
+    set.has("the reference is the noisy image itself", "bad");
+    let set = Set::damaged(|planes| swap(planes, COLOR, REFERENCE));
+    set.has("the reference is about as noisy", "bad");
+    let set = Set::damaged(|planes| each(planes, REFERENCE, |_| 0.0));
+    set.has("the reference is black", "bad");
+    let set = Set::damaged(|planes| each(planes, COLOR, |_| 0.0));
+    set.has("the noisy image is black", "bad");
+}
+
+#[test]
+fn exposures_far_apart_are_reported_in_stops() {
+    let set = Set::damaged(|planes| {
+        each(planes, COLOR, |x| 512.0 * x);
+        each(planes, REFERENCE, |x| 512.0 * x);
+    });
+    let found = set.has("exposures differ by", "bad");
+    assert!(found.contains("stops from the median"), "{found}");
+}
+
+#[test]
+fn unusable_samples_are_counted() {
+    let set = Set::damaged(|planes| {
+        let plane = planes.get_mut("ref.G").expect("a channel");
+        plane[3 * SIDE + 5] = f32::NAN;
+        plane[4 * SIDE] = f32::INFINITY;
+    });
+    let found = set.has("NaN or infinite samples", "bad");
+    assert!(
+        found.starts_with("ref.G: 2, the first NaN at x 5, y 3"),
+        "{found}"
+    );
+    let set = Set::damaged(|planes| {
+        for name in COLOR {
+            let plane = planes.get_mut(name).expect("a channel");
+            plane.iter_mut().step_by(12).for_each(|x| *x = -0.01);
+        }
+    });
+    set.has("much negative radiance", "bad");
+}
+
+#[test]
+fn features_of_a_wrong_kind_are_recognised() {
+    let set = Set::damaged(|planes| each(planes, ALBEDO, |_| 0.0));
+    set.has("texture1 is constant", "bad");
+    let set = Set::damaged(|planes| each(planes, NORMAL, |x| x / 2.0 + 0.5));
+    let found = set.has("normal: wrong space or buffer", "bad");
+    assert!(found.contains("is it packed into 0 to 1?"), "{found}");
+    let set = Set::damaged(|planes| each(planes, NORMAL, |x| 3.0 * x));
+    let found = set.has("normal: wrong space or buffer", "bad");
+    assert!(found.starts_with("its length is 3.0"), "{found}");
+    let set = Set::damaged(|planes| {
+        // A camera that looks down by 45 degrees.
+        let [y, z] = ["normal.Y", "normal.Z"].map(|name| planes[name].clone());
+        let turned = |sign: f32| {
+            let pairs = y.iter().zip(&z);
+            pairs.map(|(y, z)| (y + sign * z) * 0.5f32.sqrt()).collect()
+        };
+        planes.insert("normal.Y".to_owned(), turned(1.0));
+        let down: Vec<f32> = turned(-1.0);
+        planes.insert("normal.Z".to_owned(), down.iter().map(|x| -x).collect());
+    });
+    let found = set.has("normal: wrong space or buffer", "bad");
+    assert!(found.contains("normals in camera space"), "{found}");
+}
+
+#[test]
+fn swapped_features_are_recognised() {
+    let problems = |set: Set| -> Vec<String> {
+        let problems = set.examine().problems.into_iter();
+        problems.map(|problem| problem.problem).collect()
+    };
+    let normal = "normal: wrong space or buffer";
+    let set = Set::damaged(|planes| swap(planes, NORMAL, ALBEDO));
+    assert_eq!(problems(set), [normal, "texture1: wrong space or buffer"]);
+    let set = Set::damaged(|planes| swap(planes, NORMAL, POSITION));
+    assert_eq!(
+        problems(set),
+        ["position: its vectors have length 1", normal]
+    );
+}
+
+#[test]
+fn one_view_in_both_splits_is_found() {
+    let mut set = Set::new();
+    let mut planes = planes("col-spaceship-0");
+    // The same view, rendered again.
+    each(&mut planes, COLOR, |x| 1.01 * x);
+    each(&mut planes, REFERENCE, |x| 1.01 * x + 1e-3);
+    save(&set.path("again.exr"), planes);
+    set.scenes.push(entry("again", "test"));
+    let found = set.has("views that are in both splits", "again");
+    assert!(found.starts_with("correlates with good by "), "{found}");
+
+    let mut set = Set::new();
+    fs::copy(set.path("good.exr"), set.path("copy.exr")).expect("copied");
+    set.scenes.push(entry("copy", "train"));
+    set.has("copies of another scene", "copy");
+}
+
+#[test]
+fn mistakes_of_the_manifest_are_found() {
+    let mut set = Set::new();
+    let mut twice = entry("second", "train");
+    twice["file"] = "good.exr".into();
+    set.scenes.push(twice);
+    let found = set.has("files that are listed twice", "second");
+    assert!(found.starts_with("the file of good"), "{found}");
+
+    let mut set = Set::new();
+    set.scenes[1]["name"] = "good".into();
+    set.has("names that are listed twice", "good");
+
+    let mut set = Set::new();
+    set.scenes[1]["base"] = "other".into();
+    set.has("base scenes in both splits", "other");
+
+    let mut set = Set::new();
+    set.scenes[1]["width"] = 200.into();
+    let found = set.has("sizes differ from the manifest", "bad");
+    assert!(found.starts_with("224x224, not 200x224"), "{found}");
+}
+
+#[test]
+fn unusable_files_are_found() {
+    let set = Set::new();
+    fs::remove_file(set.path("bad.exr")).expect("removed");
+    set.has("files are missing", "bad");
+
+    let set = Set::new();
+    let bytes = fs::read(set.path("bad.exr")).expect("readable");
+    fs::write(set.path("bad.exr"), &bytes[..bytes.len() / 2]).expect("writable");
+    set.has("files cannot be read", "bad");
+
+    let set = Set::damaged(|planes| planes.retain(|name, _| !name.starts_with("ref")));
+    let found = set.has("channels are missing", "bad");
+    assert!(found.starts_with("ref.R, ref.G, ref.B"), "{found}");
+
+    let report = examine(&sample(), None, 256).expect("a data set");
+    let [problem] = &report.problems[..] else {
+        panic!("{:#?}", report.problems)
+    };
+    let expected = "images smaller than a patch of 256x256";
+    assert_eq!(
+        (problem.problem.as_str(), problem.scenes.len()),
+        (expected, 10)
+    );
+}

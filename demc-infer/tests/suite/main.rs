@@ -1,0 +1,13 @@
+//! The tests of this crate, one program: each further one would link Burn again.
+
+mod baselines;
+mod commands;
+mod common;
+mod denoise;
+mod farm;
+mod fuzz_inputs;
+mod guard;
+mod layers;
+mod moving;
+mod renderers;
+mod report_browser;

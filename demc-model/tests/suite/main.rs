@@ -1,0 +1,16 @@
+//! The tests of this crate, one program: each further one would link Burn again.
+
+#[path = "../../../tests/alone.rs"]
+mod alone;
+mod inference;
+mod layers;
+mod memory;
+mod network;
+mod ops;
+mod ops_network;
+
+use demc_kernels::memory::Recycler;
+
+/// The allocator of the programs, which counts.
+#[global_allocator]
+static ALLOCATOR: Recycler = Recycler;

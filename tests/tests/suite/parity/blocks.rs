@@ -1,0 +1,238 @@
+//! Parity of single blocks: the parts of a DEMC with the weights of the fixture `demc-READING`,
+//! each with its own inputs.
+//!
+//! The loss is `sum(outputs * probes)` with random probes, so that no gradient is trivial.
+
+use std::collections::BTreeMap;
+
+use burn::optim::GradientsParams;
+use burn::tensor::Tensor;
+use demc_model::LossConfig;
+use demc_model::ops::{self, Activation, Maps};
+use demc_model::{Denoiser, Reading, Variant};
+
+use super::{GRADIENT, OUTPUT};
+use crate::fixture::{
+    Fixture, config, gradients_by_name, host, is_bias_before_norm, network, network_name,
+};
+use crate::tensors::{Tolerance, assert_close};
+
+type BlockForward = fn(&Denoiser, Vec<Maps>) -> Vec<Maps>;
+
+#[test]
+fn fusion_is_pytorchs() {
+    let forward: BlockForward = |model, inputs| {
+        let fusion = model.fusion.as_ref().expect("a DEMC has a fusion");
+        inputs.into_iter().map(|x| fusion.forward(x)).collect()
+    };
+    in_both_readings("fusion", forward);
+}
+
+#[test]
+fn encoder_level_is_pytorchs() {
+    in_both_readings("encoders.1.levels.1", |model, inputs| {
+        encode(model, [1, 1], inputs)
+    });
+}
+
+#[test]
+fn last_level_of_the_feature_encoder_is_pytorchs() {
+    in_both_readings("encoders.0.levels.4", |model, inputs| {
+        encode(model, [0, 4], inputs)
+    });
+}
+
+#[test]
+fn latent_is_pytorchs() {
+    let forward: BlockForward = |model, inputs| {
+        inputs
+            .into_iter()
+            .map(|x| model.latent.forward(x))
+            .collect()
+    };
+    in_both_readings("latent", forward);
+}
+
+#[test]
+fn decoder_level_is_pytorchs() {
+    let forward: BlockForward = |model, mut inputs| {
+        let skips = inputs.split_off(1);
+        inputs
+            .into_iter()
+            .map(|x| model.decoder.levels[3].forward(x, skips.clone()))
+            .collect()
+    };
+    in_both_readings("decoder.levels.3", forward);
+}
+
+#[test]
+fn head_is_pytorchs() {
+    // The ReLU belongs to the decoder.
+    let forward: BlockForward = |model, inputs| {
+        inputs
+            .into_iter()
+            .map(|x| {
+                let head = model.decoder.head.as_ref().expect("a convolution");
+                x.conv3x3(head, Activation::None)
+            })
+            .collect()
+    };
+    in_both_readings("decoder.head", forward);
+}
+
+#[test]
+fn loss_and_its_gradient_are_pytorchs_at_black_pixels_too() {
+    let fixture = Fixture::read("blocks");
+    let device = super::device().autodiff();
+    let output = fixture.tensor("loss/output_gamma", &device).require_grad();
+    let reference = fixture.tensor("loss/reference_hdr", &device);
+    let ops = ops::process_default();
+    let losses = LossConfig::default().per_image(ops, output.clone(), reference, 2.2);
+    let loss = losses.mean();
+    assert_close(
+        "loss",
+        &host(loss.clone()),
+        fixture.values("loss/loss"),
+        OUTPUT,
+    );
+    let gradient = output
+        .grad(&loss.backward())
+        .expect("the loss depends on the output");
+    assert_close(
+        "gradient",
+        &host(gradient),
+        fixture.values("loss/grad"),
+        GRADIENT,
+    );
+}
+
+fn encode(model: &Denoiser, [encoder, level]: [usize; 2], inputs: Vec<Maps>) -> Vec<Maps> {
+    let level = &model.encoders[encoder].levels[level];
+    let outputs = inputs.into_iter().map(|x| level.forward(x));
+    outputs
+        .flat_map(|(skip, below)| std::iter::once(skip).chain(below))
+        .collect()
+}
+
+fn run(model: &Denoiser, forward: BlockForward, inputs: Vec<Tensor<4>>) -> Vec<Tensor<4>> {
+    let inputs = inputs.into_iter().map(|x| Maps::from_nchw(x, model.ops()));
+    let outputs = forward(model, inputs.collect());
+    outputs.into_iter().map(Maps::into_nchw).collect()
+}
+
+fn in_both_readings(path: &str, forward: BlockForward) {
+    let fixture = Fixture::read("blocks");
+    for reading in Reading::ALL {
+        let share = check(&fixture, reading, path, forward);
+        println!(
+            "{} {path}: shares of the tolerances: {share}",
+            reading.spec().name
+        );
+    }
+}
+
+fn check(fixture: &Fixture, reading: Reading, path: &str, forward: BlockForward) -> String {
+    let weights = Fixture::read(&network_name(&config(Variant::Demc, reading)));
+    let prefix = format!("{}/{path}", reading.spec().name);
+    let outputs_close = |mode: &str, outputs: &[Tensor<4>]| {
+        let expected = fixture.list(&format!("{prefix}/{mode}"), &super::device());
+        assert_eq!(outputs.len(), expected.len(), "{prefix}: number of outputs");
+        let pairs = outputs.iter().zip(expected).map(|(found, expected)| {
+            assert_eq!(found.dims(), expected.dims(), "{prefix}");
+            assert_close(
+                &format!("{prefix} {mode}"),
+                &host(found.clone()),
+                &host(expected),
+                OUTPUT,
+            )
+        });
+        pairs.fold(0.0, f32::max)
+    };
+
+    let device = super::device();
+    let model = network(&config(Variant::Demc, reading), &weights, &device);
+    let eval = outputs_close(
+        "eval",
+        &run(
+            &model,
+            forward,
+            fixture.list(&format!("{prefix}/input"), &device),
+        ),
+    );
+
+    let device = device.autodiff();
+    let model = network(&config(Variant::Demc, reading), &weights, &device);
+    let inputs: Vec<_> = fixture
+        .list(&format!("{prefix}/input"), &device)
+        .into_iter()
+        .map(Tensor::require_grad)
+        .collect();
+    let outputs = run(&model, forward, inputs.clone());
+    let train = outputs_close("train", &outputs);
+
+    let probes = fixture.list(&format!("{prefix}/probe"), &device);
+    let parts = outputs
+        .into_iter()
+        .zip(probes)
+        .map(|(output, probe)| (output * probe).sum());
+    let mut gradients = parts
+        .reduce(|a, b| a + b)
+        .expect("a block has an output")
+        .backward();
+    let mut worst = 0.0f32;
+    for (i, input) in inputs.iter().enumerate() {
+        let name = format!("{prefix}/input_grad.{i}");
+        let found = host(
+            input
+                .grad(&gradients)
+                .expect("the outputs depend on each input"),
+        );
+        worst = worst.max(assert_close(&name, &found, fixture.values(&name), GRADIENT));
+    }
+
+    let found = gradients_by_name(
+        &model,
+        &GradientsParams::from_module(&mut gradients, &model),
+    );
+    let expected: BTreeMap<_, _> = fixture
+        .group(&format!("{prefix}/grad."))
+        .into_iter()
+        .map(|w| (format!("{path}.{}", w.name), w.data))
+        .collect();
+    assert!(
+        found.keys().eq(expected.keys()),
+        "{prefix}: every parameter has a gradient, and nothing else"
+    );
+    for (name, expected) in &expected {
+        let tolerance = match is_bias_before_norm(name, reading) {
+            // Zero by construction: gradients of the other parameters are of order 1 to 1000.
+            true => Tolerance {
+                absolute: 1e-3,
+                ..GRADIENT
+            },
+            false => GRADIENT,
+        };
+        worst = worst.max(assert_close(
+            &format!("{prefix} gradient of {name}"),
+            &found[name],
+            expected,
+            tolerance,
+        ));
+    }
+
+    let after: BTreeMap<_, _> = model
+        .weights()
+        .into_iter()
+        .map(|w| (w.name, w.data))
+        .collect();
+    for running in fixture.group(&format!("{prefix}/after.")) {
+        let name = format!("{path}.{}", running.name);
+        assert_close(
+            &format!("{name} after one pass"),
+            &after[&name],
+            &running.data,
+            OUTPUT,
+        );
+    }
+    format!("eval {eval:.3}, train {train:.3}, gradients {worst:.3}")
+}

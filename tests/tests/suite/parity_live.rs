@@ -1,0 +1,138 @@
+//! Parity with an installed PyTorch: random weights are exported, loaded by `python/` with
+//! `strict=True`, and run.
+//!
+//! Needs a Python with the package of `python/` (`pip install './python[torch]'`), named by `DEMC_PYTHON`
+//! (default `python3`). Without it, the test reports that it is skipped; with
+//! `DEMC_REQUIRE_TORCH=1` it fails.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use crate::live::{FEATURES, Python, random_bundle, uniform};
+use crate::tensors::{Tolerance, assert_close, read};
+use burn::tensor::{Device, Tensor, TensorData};
+use demc_infer::{Bundle, Names, Precision};
+use demc_model::{Reading, Variant};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use safetensors::tensor::{Dtype, TensorView};
+use tempfile::TempDir;
+
+/// Two images that are not square; files do not state the size.
+const SHAPE: [usize; 4] = [2, 3, 64, 96];
+
+/// The guaranteed deviation relative to the largest value of the output; measured: 1e-6.
+const OUTPUT: Tolerance = Tolerance {
+    absolute: 0.0,
+    of_largest: 1e-4,
+    of_value: 0.0,
+};
+
+#[test]
+fn pytorch_loads_every_export_strictly_and_agrees() {
+    let Some(python) = Python::with("torch, demc", "'./python[torch]'", "DEMC_REQUIRE_TORCH")
+    else {
+        return;
+    };
+    for variant in Variant::ALL {
+        for reading in Reading::ALL {
+            agrees(&python, variant, reading, Names::Torch, Precision::F32);
+        }
+    }
+    agrees(
+        &python,
+        Variant::Demc,
+        Reading::Released,
+        Names::Burn,
+        Precision::F32,
+    );
+    agrees(
+        &python,
+        Variant::Demc,
+        Reading::Released,
+        Names::Torch,
+        Precision::F16,
+    );
+}
+
+fn agrees(python: &Python, variant: Variant, reading: Reading, names: Names, precision: Precision) {
+    // New weights and inputs in each run; every failure names the seed.
+    let seed: u64 = rand::random();
+    let what = format!(
+        "{}, {} reading, {names:?} names, {precision:?}, seed {seed}",
+        variant.spec().name,
+        reading.spec().name
+    );
+    let folder = TempDir::new().expect("a temporary directory");
+    let [bundle, input, output] = ["bundle", "input", "output"]
+        .map(|name| folder.path().join(name).with_extension("safetensors"));
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    random_bundle(variant, reading, -0.05..0.1, &mut rng)
+        .save(&bundle, names, precision)
+        .expect("the bundle is written");
+    let [_, colors, height, width] = SHAPE;
+    let color_gamma = uniform(0.0, 1.5, SHAPE[0] * colors * height * width, &mut rng);
+    let features_z = uniform(-1.7, 1.7, SHAPE[0] * FEATURES * height * width, &mut rng);
+    write_input(&input, &color_gamma, &features_z);
+
+    let text = |path: &PathBuf| path.to_str().expect("a path in UTF-8").to_string();
+    let run = python
+        .run([
+            "-m",
+            "demc.torch",
+            &text(&bundle),
+            &text(&input),
+            &text(&output),
+        ])
+        .expect("it ran before");
+    assert!(
+        run.status.success(),
+        "{what}: {}",
+        String::from_utf8_lossy(&run.stderr)
+    );
+
+    // The file is already rounded to f16, for both sides.
+    let device = Device::flex();
+    let model = Bundle::load(&bundle, &device)
+        .expect("the bundle loads")
+        .model;
+    let tensor = |values, channels| {
+        Tensor::<4>::from_data(
+            TensorData::new(values, [SHAPE[0], channels, height, width]),
+            &device,
+        )
+    };
+    let ours = model.forward(tensor(color_gamma, colors), tensor(features_z, FEATURES));
+    let ours: Vec<f32> = ours.into_data().try_to_vec().expect("float32");
+    let theirs = &read(&output)["output"];
+    assert_eq!(theirs.shape, SHAPE, "{what}");
+    let lit = theirs.data.iter().filter(|&&v| v > 0.1).count();
+    assert!(
+        lit > theirs.data.len() / 2,
+        "{what}: an output of nearly only zeros tests nothing"
+    );
+    let share = assert_close(&what, &ours, &theirs.data, OUTPUT);
+    println!(
+        "{what}: {:.1e} of the largest value",
+        share * OUTPUT.of_largest
+    );
+}
+
+fn write_input(path: &Path, color_gamma: &[f32], features_z: &[f32]) {
+    let bytes = |values: &[f32]| {
+        values
+            .iter()
+            .flat_map(|v| v.to_le_bytes())
+            .collect::<Vec<u8>>()
+    };
+    let (color, features) = (bytes(color_gamma), bytes(features_z));
+    let shape = |channels| vec![SHAPE[0], channels, SHAPE[2], SHAPE[3]];
+    let view = |channels, bytes| {
+        TensorView::new(Dtype::F32, shape(channels), bytes).expect("a shape that fits")
+    };
+    let views = HashMap::from([
+        ("color_gamma", view(SHAPE[1], &color)),
+        ("features_z", view(FEATURES, &features)),
+    ]);
+    safetensors::serialize_to_file(views, None, path).expect("a writable temporary directory");
+}
