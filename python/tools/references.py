@@ -5,7 +5,7 @@
     demc-train --config configs/renders.toml --set data.root=data/clean
 
 Use it for references of some hundred samples per pixel, which have visible noise
-(docs/experiments.md has its effect).
+(results/experiments.md has its effect).
 
 - The channels are found as `demc-infer` finds them, per file (docs/data.md#channel-layouts).
 - Its guides are albedo and normal, both denoised first. They come from the reference's own samples
