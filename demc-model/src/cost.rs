@@ -7,7 +7,7 @@ use crate::weights::{Role, Stage, WeightSpec};
 const MULTIPLY_ADD: f64 = 2.0;
 
 /// Values in memory at the peak of a training step per output value of a kernel. Measured:
-/// `demc-train/tests/memory.rs`.
+/// `demc-train/tests/suite/memory.rs`.
 const MAPS_KEPT: f64 = 1.5;
 
 /// Values in memory per weight: the weight, its gradient and two moments.
