@@ -6,7 +6,7 @@ use std::collections::HashSet;
 use std::fs;
 use std::path::Path;
 
-use demc_data::transform::STD_FLOOR;
+use demc_data::input::transform::STD_FLOOR;
 use demc_data::{ChannelLayout, DataConfig, Dataset, Error, Scene, Split, Statistics, read_frame};
 use serde_json::{Value, json};
 use support::{half, layout, sample, scene_channels, write};

@@ -1,4 +1,4 @@
-//! Damaged copies of sample scenes, and what `demc_data::doctor` finds in them.
+//! Damaged copies of sample scenes, and what `demc_data::check::doctor` finds in them.
 
 mod support;
 
@@ -6,8 +6,8 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use demc_data::doctor::{Report, examine};
-use demc_data::exr::ExrFile;
+use demc_data::check::doctor::{Report, examine};
+use demc_data::image::exr::ExrFile;
 use exr::prelude::FlatSamples;
 use serde_json::{Value, json};
 use support::{sample, write};

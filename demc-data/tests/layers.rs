@@ -4,10 +4,10 @@ mod support;
 
 use std::path::Path;
 
-use demc_data::exr::ExrFile;
-use demc_data::exr::rewrite::rewrite_with_layers;
-use demc_data::frame::layers::{check_layers, decode_layers};
-use demc_data::plane::Plane;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::frame::layers::{check_layers, decode_layers};
+use demc_data::image::plane::Plane;
+use demc_data::image::rewrite::rewrite_with_layers;
 use demc_data::{Error, OutputChannels, SamplePrecision, WriteOptions};
 use exr::prelude::{Compression as Method, FlatSamples, SampleType};
 use support::files::{header, rgb_kinds, scene_kinds, write_file};

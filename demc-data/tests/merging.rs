@@ -1,13 +1,13 @@
-//! Files joined by `demc_data::exr::merge`: bits, types, attributes, and refusals.
+//! Files joined by `demc_data::image::exr::merge`: bits, types, attributes, and refusals.
 
 mod support;
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use demc_data::channel::ChannelType;
-use demc_data::exr::ExrFile;
-use demc_data::exr::merge::{MergeInput, Merged, merge};
+use demc_data::image::channel::ChannelType;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::exr::merge::{MergeInput, Merged, merge};
 use demc_data::{ChannelLayout, Error};
 use exr::meta::attribute::IntegerBounds;
 use exr::prelude::{Compression, FlatSamples};

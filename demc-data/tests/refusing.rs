@@ -5,8 +5,8 @@ mod support;
 use std::fs;
 use std::path::Path;
 
-use demc_data::exr::{ExrFile, MAX_SIDE};
-use demc_data::frame::decode_repaired;
+use demc_data::image::exr::{ExrFile, MAX_SIDE};
+use demc_data::image::frame::decode_repaired;
 use demc_data::{ChannelLayout, read_frame};
 use exr::prelude::*;
 use rand::{RngExt, SeedableRng};

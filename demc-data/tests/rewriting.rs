@@ -6,10 +6,9 @@ use std::fs::{self, File};
 use std::io::BufReader;
 use std::path::Path;
 
-use demc_data::exr::ExrFile;
-use demc_data::{
-    Change, Compression, WriteOptions, Written, frame, rewrite as rewriting, write_denoised,
-};
+use demc_data::image::exr::ExrFile;
+use demc_data::image::{frame, rewrite as rewriting};
+use demc_data::{Change, Compression, WriteOptions, Written, write_denoised};
 use exr::math::RoundingMode;
 use exr::meta::BlockDescription;
 use exr::meta::attribute::LevelMode;
@@ -97,7 +96,7 @@ fn threads_and_cached_blocks_do_not_change_the_output() {
         for threads in [1, 3, 100] {
             // Memory for no blocks, for some, and for all.
             for room in [0, 5_000_000, usize::MAX] {
-                let mut file = open(threads).keeping(&layout, room);
+                let mut file = open(threads).keeping(&layout.color, room);
                 // Twice from one file, which is read again.
                 for _ in 0..2 {
                     let again = frame::decode_input(&mut file, &layout).expect("sound");

@@ -5,8 +5,8 @@ mod support;
 use std::fs;
 use std::process::Command;
 
-use demc_data::exr::ExrFile;
-use demc_data::plane::Plane;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::plane::Plane;
 use demc_data::{
     Change, ChannelLayout, Compression, Error, OutputChannels, SamplePrecision, WriteOptions,
     Written, write_denoised,

@@ -2,7 +2,7 @@
 
 mod support;
 
-use demc_data::rgb::read_rgb;
+use demc_data::image::rgb::read_rgb;
 use demc_data::{Error, SamplePrecision, write_rgb};
 
 #[test]

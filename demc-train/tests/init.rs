@@ -8,9 +8,9 @@ use std::process::Command;
 
 use burn::tensor::Device;
 use common::{RESULTS, assert_same_run, config, error_line, kill_after, metrics, train, trained};
-use demc_data::checksum::sha256_of;
 use demc_infer::Bundle;
 use demc_infer::bundle::{Names, Precision};
+use demc_program::checksum::sha256_of;
 
 /// The best weights of a run without running statistics, which change at any learning rate.
 fn weights(run: &Path) -> Vec<(String, Vec<f32>)> {

@@ -13,8 +13,8 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
-use demc_data::exr::ExrFile;
-use demc_data::plane::Plane;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::plane::Plane;
 use demc_data::{Frame, Normalizer, PositionSpace};
 use demc_infer::verify::{Runtime, verify};
 use demc_infer::{Bundle, BundleError, BundleFile, Names, Precision};
