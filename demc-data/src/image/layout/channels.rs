@@ -71,9 +71,43 @@ pub struct ChannelLayout {
     /// Alpha of the colour, 0 to 1, which is denoised with it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub alpha: Option<String>,
+    /// Other names of feature buffers, for files that lack the names above.
+    #[serde(default, skip_serializing_if = "Alternatives::is_empty")]
+    pub alternatives: Alternatives,
     /// Policies for missing feature buffers.
     #[serde(default)]
     pub missing: MissingPolicies,
+}
+
+/// Other names of each feature buffer. If a file has none of a buffer's channels, the first names of
+/// which it has a channel take their place.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Alternatives {
+    /// For the normal.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub normal: Vec<Triple>,
+    /// For the position.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub position: Vec<Triple>,
+    /// For the first texture.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub texture1: Vec<Triple>,
+    /// For the second texture.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub texture2: Vec<Triple>,
+}
+
+impl Alternatives {
+    /// Whether no buffer has other names.
+    pub fn is_empty(&self) -> bool {
+        self.in_order().into_iter().all(|names| names.is_empty())
+    }
+
+    /// The names in the order of the network's buffers: normal, position, texture1, texture2.
+    pub fn in_order(&self) -> [&[Triple]; 4] {
+        [&self.normal, &self.position, &self.texture1, &self.texture2]
+    }
 }
 
 /// The replacement for each missing feature buffer.
@@ -189,6 +223,17 @@ impl ChannelLayout {
                 ));
             }
         }
+        for ((buffer, names, _), others) in self
+            .features()
+            .into_iter()
+            .zip(self.alternatives.in_order())
+        {
+            if names.is_none() && !others.is_empty() {
+                problems.push(format!(
+                    "alternatives.{buffer} needs {buffer}, the names that come first"
+                ));
+            }
+        }
         let mut seen = HashSet::new();
         let features = self
             .features()
@@ -197,6 +242,7 @@ impl ChannelLayout {
         let all = features
             .chain([&self.color])
             .chain(&self.reference)
+            .chain(self.alternatives.in_order().into_iter().flatten())
             .flatten()
             .chain(&self.mask)
             .chain(&self.alpha);

@@ -5,7 +5,9 @@ use std::io::{Read, Seek};
 
 use demc_program::message::list;
 
-use super::channels::{ANY_LAYER, ChannelLayout, Missing, MissingPolicies, PRESETS, Triple};
+use super::channels::{
+    ANY_LAYER, Alternatives, ChannelLayout, Missing, MissingPolicies, PRESETS, Triple,
+};
 use crate::error::Error;
 use crate::image::exr::ExrFile;
 
@@ -30,7 +32,8 @@ impl FileLayout {
 }
 
 impl ChannelLayout {
-    /// This layout with the names of one file: a view layer's name in place of `*`.
+    /// This layout with the names of one file: a view layer's name in place of `*`, and alternatives
+    /// in place of names that the file lacks.
     ///
     /// `layer` chooses among several view layers.
     ///
@@ -44,7 +47,8 @@ impl ChannelLayout {
     ) -> Result<Cow<'_, Self>, Error> {
         if !self.has_any_layer() {
             return match layer {
-                None => Ok(Cow::Borrowed(self)),
+                None if self.alternatives.is_empty() => Ok(Cow::Borrowed(self)),
+                None => Ok(Cow::Owned(self.clone().named_as_in(file))),
                 Some(layer) => Err(problem(
                     file,
                     format!("view layer {layer:?}: the names of the layout have no `*` for it"),
@@ -54,9 +58,9 @@ impl ChannelLayout {
         let layers = self.layers(file);
         match (layer, &layers[..]) {
             (Some(layer), all) if all.iter().any(|found| found == layer) => {
-                Ok(Cow::Owned(self.with_layer(layer)))
+                Ok(Cow::Owned(self.with_layer(layer).named_as_in(file)))
             }
-            (None, [layer]) => Ok(Cow::Owned(self.with_layer(layer))),
+            (None, [layer]) => Ok(Cow::Owned(self.with_layer(layer).named_as_in(file))),
             (_, []) => Err(file
                 .require(&self.color.each_ref().map(String::as_str))
                 .expect_err("a name with `*` is in no file")),
@@ -71,7 +75,8 @@ impl ChannelLayout {
         }
     }
 
-    /// Whether a file has all channels of this layout that it must have for denoising.
+    /// Whether a file has all channels of this layout that it must have for denoising. The layout has
+    /// the names of the file ([`in_file`](Self::in_file)).
     pub fn fits<R: Read + Seek>(&self, file: &ExrFile<R>) -> bool {
         found_and_lacking(file, self, self.missing).1.is_empty()
     }
@@ -83,9 +88,21 @@ impl ChannelLayout {
             &mut self.texture1,
             &mut self.texture2,
         ];
-        let triples = features.into_iter().chain([&mut self.reference]).flatten();
-        let triples = triples.chain([&mut self.color]).flatten();
-        triples.chain(&mut self.mask).chain(&mut self.alpha)
+        let others = [
+            &mut self.alternatives.normal,
+            &mut self.alternatives.position,
+            &mut self.alternatives.texture1,
+            &mut self.alternatives.texture2,
+        ];
+        features
+            .into_iter()
+            .chain([&mut self.reference])
+            .flatten()
+            .chain([&mut self.color])
+            .chain(others.into_iter().flatten())
+            .flatten()
+            .chain(&mut self.mask)
+            .chain(&mut self.alpha)
     }
 
     fn has_any_layer(&self) -> bool {
@@ -106,6 +123,32 @@ impl ChannelLayout {
             names.all(|name| file.channel(&name).is_some())
         };
         layers.filter(is_whole).map(str::to_owned).collect()
+    }
+
+    /// This layout with alternatives in place of names that the file lacks, and without the others.
+    fn named_as_in<R: Read + Seek>(mut self, file: &ExrFile<R>) -> Self {
+        let Alternatives {
+            normal,
+            position,
+            texture1,
+            texture2,
+        } = std::mem::take(&mut self.alternatives);
+        // One channel of three counts: the other two are a mistake, not a missing buffer.
+        let is_in_file = |names: &Triple| names.iter().any(|name| file.channel(name).is_some());
+        for (names, others) in [
+            (&mut self.normal, normal),
+            (&mut self.position, position),
+            (&mut self.texture1, texture1),
+            (&mut self.texture2, texture2),
+        ] {
+            if let Some(names) = names
+                && !is_in_file(names)
+                && let Some(other) = others.into_iter().find(is_in_file)
+            {
+                *names = other;
+            }
+        }
+        self
     }
 
     fn with_layer(&self, layer: &str) -> Self {
@@ -157,6 +200,7 @@ pub fn detect<R: Read + Seek>(
                 Some(layer) => pattern.with_layer(layer),
                 None => pattern.clone(),
             };
+            let layout = layout.named_as_in(file);
             let (found, lacking) = found_and_lacking(file, &layout, missing);
             if lacking.is_empty() {
                 fits.push(FileLayout {

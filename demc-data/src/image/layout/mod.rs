@@ -10,6 +10,9 @@
 //! texture1 = ["albedo.R", "albedo.G", "albedo.B"]
 //!
 //! # `*.` at the start of all names stands for a view layer: "*.Combined.R".
+//! [alternatives]              # other names, for files without the names above
+//! normal = [["nn.X", "nn.Y", "nn.Z"]]
+//!
 //! [missing]                   # "error" (default) or "zeros"; for texture2 also "copy-texture1"
 //! texture2 = "copy-texture1"
 //! ```
@@ -19,5 +22,7 @@ mod detect;
 #[cfg(test)]
 mod tests;
 
-pub use channels::{ANY_LAYER, ChannelLayout, Missing, MissingPolicies, PRESETS, Triple};
+pub use channels::{
+    ANY_LAYER, Alternatives, ChannelLayout, Missing, MissingPolicies, PRESETS, Triple,
+};
 pub use detect::{FileLayout, detect};

@@ -165,6 +165,62 @@ fn each_preset_is_found_by_its_channels() {
     }
 }
 
+/// The channels of Mitsuba's colour and albedo, and these buffers of three channels.
+fn mitsuba(buffers: &[&str]) -> Vec<String> {
+    let buffers = buffers
+        .iter()
+        .flat_map(|buffer| ["X", "Y", "Z"].map(|axis| format!("{buffer}.{axis}")));
+    let albedo = RGB.map(|channel| format!("albedo.{channel}"));
+    buffers.chain(albedo).chain(RGB.map(String::from)).collect()
+}
+
+#[test]
+fn the_names_in_mitsubas_manual_are_found() {
+    for (normal, position) in [
+        ("nn", "pos"),
+        ("normals", "pos"),
+        ("normal", "pos"),
+        ("nn", "position"),
+    ] {
+        let found = detected(&mitsuba(&[normal, position]), None).expect(normal);
+        assert_eq!(found.preset, "mitsuba3");
+        let first = |names: Option<Triple>| names.expect("found")[0].clone();
+        assert_eq!(first(found.layout.normal), format!("{normal}.X"));
+        assert_eq!(first(found.layout.position), format!("{position}.X"));
+    }
+}
+
+#[test]
+fn alternatives_are_whole_names_and_come_after_the_layouts_own() {
+    let found = detected(
+        &mitsuba(&["nn", "normal", "normals", "position", "pos"]),
+        None,
+    );
+    let layout = found.expect("its own names").layout;
+    assert_eq!(layout.normal.expect("found")[0], "normal.X");
+    assert_eq!(layout.position.expect("found")[0], "position.X");
+    assert!(layout.alternatives.is_empty());
+    let error = detected(&mitsuba(&["nnn", "pos"]), None).expect_err("another name");
+    assert!(error.contains("mitsuba3, lacks normal.X"), "{error}");
+    let mut part = mitsuba(&["nn", "pos"]);
+    part.retain(|name| name != "nn.Y");
+    let error = detected(&part, None).expect_err("one of three");
+    assert!(error.ends_with("mitsuba3, lacks nn.Y"), "{error}");
+}
+
+#[test]
+fn alternatives_need_names_and_name_no_channel_twice() {
+    let error = message(&format!(
+        "{MINIMAL}\n[alternatives]\nnormal = [[\"p.X\", \"b\", \"c\"]]\ntexture2 = [[\"d\", \"e\", \"f\"]]"
+    ));
+    for part in [
+        "\"p.X\" is named twice",
+        "alternatives.texture2 needs texture2",
+    ] {
+        assert!(error.contains(part), "{part} is not in: {error}");
+    }
+}
+
 #[test]
 fn position_and_second_texture_may_be_absent_but_not_in_part() {
     let without = ["position", "texture2"];
