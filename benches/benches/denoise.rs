@@ -16,9 +16,9 @@ use std::path::{Path, PathBuf};
 use demc_bench::case;
 use demc_bench::stopwatch::{Spread, Turns, interleaved};
 use demc_data::Frame;
-use demc_data::exr::ExrFile;
-use demc_data::exr::rewrite::{WriteOptions, rewrite};
-use demc_data::frame::{decode_input, read_input};
+use demc_data::image::exr::ExrFile;
+use demc_data::image::frame::{decode_input, read_input};
+use demc_data::image::rewrite::{WriteOptions, rewrite};
 use demc_infer::denoise::{DenoiseOptions, unobserved};
 use demc_infer::{Bundle, Ensemble, Tiling};
 
@@ -125,7 +125,7 @@ fn files(bundle: &Bundle, file: &Path) -> anyhow::Result<()> {
         [
             &mut || {
                 let input = ExrFile::open(file).expect("it was read before");
-                let mut input = input.keeping(layout, KEPT_BYTES);
+                let mut input = input.keeping(&layout.color, KEPT_BYTES);
                 let frame = decode_input(&mut input, layout).expect("it was read before");
                 std::hint::black_box(frame);
                 open.replace(Some(input));

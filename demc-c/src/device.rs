@@ -5,10 +5,10 @@ use std::ptr;
 use std::sync::{Mutex, PoisonError};
 use std::thread::{Builder, JoinHandle};
 
-use demc_data::parallel;
 use demc_infer::device;
 use demc_infer::memory::below_own_limits;
 use demc_model::ops::{ISA_VARIABLE, Isa};
+use demc_program::parallel;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
 use crate::error::{DemcError, Failure, ThreadErrors, fetch, guarded};

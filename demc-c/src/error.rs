@@ -9,9 +9,9 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-use demc_data::message::printable;
 use demc_infer::buffers::BufferError;
 use demc_infer::{BundleError, DenoiseError, DeviceError};
+use demc_program::message::printable;
 
 use crate::device::Device;
 

@@ -3,7 +3,7 @@
 use std::ffi::{c_uint, c_void};
 use std::slice;
 
-use demc_data::exr::check_size;
+use demc_data::image::exr::check_size;
 use demc_infer::buffers::{BufferError, Sample, View, ViewMut, extent};
 
 use crate::error::Failure;

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::ffi::{CString, c_char, c_void};
 use std::ptr;
 
-use demc_data::message::printable;
+use demc_program::message::printable;
 
 use crate::image::Image;
 

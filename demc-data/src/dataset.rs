@@ -4,18 +4,20 @@
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::fmt;
-use std::io;
 use std::num::NonZero;
 use std::path::{Path, PathBuf};
 
+use demc_program::file::{self, FileError, FileId};
+use demc_program::message::printable;
+use demc_program::output::Outputs;
 use rand::seq::SliceRandom;
 use serde::{Deserialize, Serialize};
 
-use crate::channel::Window;
-use crate::frame::{Presence, check_header};
-use crate::message::printable;
+use crate::error::Error;
+use crate::image::channel::Window;
+use crate::image::frame::{Presence, check_header};
+use crate::image::layout::ChannelLayout;
 use crate::seed::{RandomStream, generator};
-use crate::{ChannelLayout, Error, file};
 
 /// The manifest format that this version reads and writes.
 pub const FORMAT: &str = "demc-exr 1";
@@ -111,7 +113,7 @@ impl Dataset {
     /// manifest, and holds the channels of `layout`, including the reference. Decodes no pixels.
     ///
     /// # Errors
-    /// [`Error::Read`] without a manifest, otherwise [`Error::Dataset`] with all problems.
+    /// [`FileError::Read`] without a manifest, otherwise [`Error::Dataset`] with all problems.
     pub fn open(root: &Path, layout: &ChannelLayout) -> Result<Self, Error> {
         let scenes = Self::list(root)?;
         let mut problems = manifest_problems(&scenes);
@@ -120,24 +122,38 @@ impl Dataset {
         }
         problems.extend(repeated_files(&scenes));
         problems.extend(file_problems(&scenes, layout));
-        match problems.is_empty() {
-            true => Ok(Self {
-                root: root.to_owned(),
-                scenes,
-            }),
-            false => Err(unusable(root, problems)),
+        if !problems.is_empty() {
+            return Err(unusable(root, problems));
         }
+        Ok(Self {
+            root: root.to_owned(),
+            scenes,
+        })
     }
 
     /// The scenes that `root/manifest.json` lists. Their files are not checked.
     ///
     /// # Errors
-    /// [`Error::Read`] without a manifest, [`Error::Dataset`] if it is malformed.
+    /// [`FileError::Read`] without a manifest, [`Error::Dataset`] if it is malformed.
     pub fn list(root: &Path) -> Result<Vec<Scene>, Error> {
         let path = root.join("manifest.json");
-        let text = file::read_text(&path, MAX_MANIFEST);
-        let text = text.map_err(|source| Error::Read { path, source })?;
+        let text = file::read_text(&path, MAX_MANIFEST)
+            .map_err(|source| FileError::Read { path, source })?;
         parse(root, &text).map_err(|problem| unusable(root, vec![problem]))
+    }
+
+    /// Notes the manifest and the scenes of the data set in `root`: no output may replace them.
+    /// Returns the scenes.
+    ///
+    /// # Errors
+    /// As [`list`](Self::list).
+    pub fn protect(root: &Path, outputs: &mut Outputs) -> Result<Vec<Scene>, Error> {
+        outputs.protect(&root.join("manifest.json"), "the manifest");
+        let scenes = Self::list(root)?;
+        for scene in &scenes {
+            outputs.protect(&scene.path, &format!("scene {}", scene.name));
+        }
+        Ok(scenes)
     }
 
     /// The scenes of a split, in the manifest's order.
@@ -151,13 +167,11 @@ impl Dataset {
             .filter(|scene| scene.split == split)
             .cloned()
             .collect();
-        match scenes.is_empty() {
-            true => Err(unusable(
-                &self.root,
-                vec![format!("no scene is in the {split} split")],
-            )),
-            false => Ok(scenes),
+        if scenes.is_empty() {
+            let problem = format!("no scene is in the {split} split");
+            return Err(unusable(&self.root, vec![problem]));
         }
+        Ok(scenes)
     }
 
     /// Divides the training split into scenes for training and for validation. A `share` of its
@@ -241,7 +255,7 @@ fn repeated_files(scenes: &[Scene]) -> Vec<String> {
     let mut problems = Vec::new();
     for scene in scenes {
         // Missing files are another problem.
-        let Ok(id) = file_id(&scene.path) else {
+        let Ok(id) = FileId::of_existing(&scene.path) else {
             continue;
         };
         match first.entry(id) {
@@ -256,24 +270,6 @@ fn repeated_files(scenes: &[Scene]) -> Vec<String> {
         }
     }
     problems
-}
-
-/// Device and inode: equal for hard links, too.
-#[cfg(unix)]
-type FileId = (u64, u64);
-#[cfg(not(unix))]
-type FileId = PathBuf;
-
-#[cfg(unix)]
-fn file_id(path: &Path) -> io::Result<FileId> {
-    use std::os::unix::fs::MetadataExt;
-    let found = std::fs::metadata(path)?;
-    Ok((found.dev(), found.ino()))
-}
-
-#[cfg(not(unix))]
-fn file_id(path: &Path) -> io::Result<FileId> {
-    std::fs::canonicalize(path)
 }
 
 /// Problems with the scenes' files. If several files lack the same channels, that is one problem,

@@ -3,24 +3,16 @@
 
 use std::path::PathBuf;
 
-use crate::message::list;
+use demc_program::file::FileError;
+use demc_program::message::list;
 
 /// An error of this crate.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "the messages explain the fields")]
 pub enum Error {
-    /// A file could not be opened or read.
-    #[error("cannot read {}", path.display())]
-    Read {
-        path: PathBuf,
-        source: std::io::Error,
-    },
-    /// An output could not be written; no partial file remains.
-    #[error("cannot write {}", path.display())]
-    Write {
-        path: PathBuf,
-        source: std::io::Error,
-    },
+    /// A file could not be read or written.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// Not an OpenEXR file, truncated, damaged, or of an unsupported kind (deep data, subsampling).
     #[error("{}: not a readable OpenEXR file: {detail}", path.display())]
     Exr { path: PathBuf, detail: String },

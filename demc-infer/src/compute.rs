@@ -63,7 +63,7 @@ impl ComputeFlags {
 const LEAST_MEMORY: u64 = 128 << 20;
 
 /// Runs a program's `work` on one of its threads: as many as `RAYON_NUM_THREADS` asks for, at most
-/// four per processor ([`demc_data::parallel::threads`]). The first call starts them.
+/// four per processor ([`demc_program::parallel::threads`]). The first call starts them.
 ///
 /// # Errors
 /// The process's limits leave too little memory or too few threads.
@@ -84,7 +84,7 @@ fn start() -> Result<(), StartError> {
         let left = left >> 20;
         return Err(StartError::Memory { left });
     }
-    let count = demc_data::parallel::threads().count;
+    let count = demc_program::parallel::threads().count;
     ops::start_threads(count).map_err(|error| StartError::Threads {
         count,
         reason: error.to_string(),

@@ -1,7 +1,7 @@
 //! Why a frame cannot be denoised or scored.
 
 use burn::tensor::TensorReadError;
-use demc_data::exr::{UnsupportedSize, check_size};
+use demc_data::image::exr::{UnsupportedSize, check_size};
 use demc_data::{FEATURES, Frame};
 use demc_model::Head;
 use demc_model::config::COLOR_CHANNELS;

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use demc_data::Frame;
 use demc_model::metrics::DISPLAY_GAMMA;
+use demc_program::file::{FileError, write_whole};
 use serde::{Deserialize, Serialize};
 
 /// Pixels between two pictures of a strip.
@@ -155,8 +156,8 @@ impl Picture {
     ///
     /// # Errors
     /// As [`to_png`](Self::to_png), or the path cannot be written.
-    pub fn write_png(&self, path: &Path) -> Result<(), demc_data::Error> {
-        demc_data::file::write_whole(path, |file| {
+    pub fn write_png(&self, path: &Path) -> Result<(), FileError> {
+        write_whole(path, |file| {
             io::Write::write_all(file, &self.to_png().map_err(io::Error::other)?)
         })
     }

@@ -11,7 +11,7 @@
 
 use std::ops::Range;
 
-use demc_data::exr::MAX_SIDE;
+use demc_data::image::exr::MAX_SIDE;
 use demc_model::DOWNSAMPLING;
 
 use crate::memory::TooLarge;

@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use demc_data::Frame;
-use demc_data::layout::Missing;
+use demc_data::image::layout::Missing;
 use demc_infer::buffers::{BufferError, Buffers, View};
 use demc_infer::denoise::{DenoiseOptions, DenoiseProgress, Denoised, Layer};
 use demc_infer::guard::EnergyBias;
@@ -77,7 +77,7 @@ impl PyBundle {
         let measure = |_: Caller<()>| -> Result<Option<f64>, BufferError> {
             let planes = color.view()?.to_planar()?;
             let is_finite = planes.iter().all(|sample| sample.is_finite());
-            Ok(is_finite.then(|| demc_data::ranges::exposure(&planes)))
+            Ok(is_finite.then(|| demc_data::input::ranges::exposure(&planes)))
         };
         let exposure = work::run(py, measure, work::UNHEARD)?.map_err(exception)?;
         let exposure =

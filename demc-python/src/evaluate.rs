@@ -2,13 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use demc_data::exr::ExrFile;
-use demc_data::layout::detect;
-use demc_data::message::printable;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::layout::detect;
 use demc_data::{ChannelLayout, Dataset, Scene, Split};
 use demc_infer::denoise::{DenoiseOptions, unobserved};
 use demc_infer::evaluate::FailedImage;
 use demc_infer::{Bundle, Ensemble, ImageScore, Report};
+use demc_program::message::printable;
 use pyo3::prelude::*;
 
 use crate::bundle::PyBundle;

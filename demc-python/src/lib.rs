@@ -41,7 +41,7 @@ mod native {
     /// The layouts of renderers' files: pairs of name and TOML text.
     #[pyfunction]
     fn presets() -> Vec<(&'static str, &'static str)> {
-        demc_data::layout::PRESETS.to_vec()
+        demc_data::image::layout::PRESETS.to_vec()
     }
 
     /// Runs `demc-infer` with its name and arguments. Returns the exit code.

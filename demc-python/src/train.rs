@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use demc_data::message;
 use demc_infer::device;
+use demc_program::message;
 use demc_train::Config;
 use demc_train::ranks::Ranks;
 use demc_train::run::observer::TakenStep;

@@ -5,9 +5,9 @@ use std::io::Cursor;
 use std::path::Path;
 
 use demc_data::ChannelLayout;
-use demc_data::channel::ChannelType;
-use demc_data::exr::ExrFile;
-use demc_data::frame::{FramePlanes, Presence};
+use demc_data::image::channel::ChannelType;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::frame::{FramePlanes, Presence};
 use demc_fuzz::{allow_caught_panics, check_message};
 use libfuzzer_sys::fuzz_target;
 

@@ -5,9 +5,9 @@ use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
-use demc_data::exr::ExrFile;
-use demc_data::frame::decode_input;
-use demc_data::rewrite::rewrite;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::frame::decode_input;
+use demc_data::image::rewrite::rewrite;
 use demc_data::{ChannelLayout, WriteOptions};
 use demc_fuzz::{allow_caught_panics, scratch};
 use libfuzzer_sys::fuzz_target;
@@ -26,14 +26,14 @@ fuzz_target!(init: allow_caught_panics(), |bytes: &[u8]| {
     if pixels > 1 << 20 {
         return;
     }
-    let names = |file: &[demc_data::channel::Channel]| -> Vec<_> {
+    let names = |file: &[demc_data::image::channel::Channel]| -> Vec<_> {
         file.iter().map(|c| (c.name.clone(), c.window, c.layer.clone())).collect()
     };
     let expected = names(file.channels());
     let output = DIR.join("out.exr");
     let color = vec![0.5; 3 * pixels];
     // As in `demc-infer denoise`, reading keeps decoded blocks for writing; here only some of them.
-    let mut file = file.keeping(&layout, 4096);
+    let mut file = file.keeping(&layout.color, 4096);
     let _ = decode_input(&mut file, &layout);
     if rewrite(&mut file, &layout, &color, &output, &WriteOptions::default()).is_ok() {
         let mut written = ExrFile::open(&output).expect("what was written is readable");

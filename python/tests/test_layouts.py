@@ -73,6 +73,32 @@ class Detection(Files):
         self.assertEqual(np.abs(frame.features[3:6]).max(), 0)
         np.testing.assert_array_equal(frame.features[6:9], frame.features[9:])
 
+    def test_the_names_in_mitsubas_manual_are_found(self) -> None:
+        renamed = lambda normal, position: [
+            name.replace("normal", normal).replace("position", position) for name in MITSUBA
+        ]
+        for normal, position in (("nn", "pos"), ("normals", "pos"), ("normal", "pos")):
+            self.write(self.planes(renamed(normal, position)))
+            for preset in (None, "mitsuba3"):
+                frame = demc.torch.read_exr(self.path, preset)
+                self.assertEqual(frame.layout.name, "mitsuba3")
+                self.assertEqual(frame.layout.channels["normal"][0], f"{normal}.X")
+                self.assertEqual(frame.layout.channels["position"][2], f"{position}.Z")
+        self.write(self.planes(name for name in renamed("nn", "pos") if name != "nn.Y"))
+        self.refused("the nearest, mitsuba3, lacks nn.Y")
+        self.write(self.planes(MITSUBA + renamed("nn", "pos")[3:9]))
+        self.assertEqual(demc.torch.read_exr(self.path).layout.channels["normal"][0], "normal.X")
+        self.write(self.planes(renamed("nnn", "pos")))
+        self.refused("the nearest, mitsuba3, lacks normal.X, normal.Y, normal.Z")
+
+    def test_alternatives_need_names_and_name_no_channel_twice(self) -> None:
+        table = {"color": ["a", "b", "c"], "normal": ["d", "e", "f"], "missing": dict.fromkeys(layouts.BUFFERS[1:], "zeros")}
+        table["alternatives"] = {"normal": [["g", "h", "a"]], "position": [["x", "y", "z"]], "depth": []}
+        with self.assertRaises(ValueError) as caught:
+            layouts.Layout.from_table("own", table)
+        for problem in ('channel "a" is named twice', "alternatives.position needs position", "unknown key alternatives.depth"):
+            self.assertIn(problem, str(caught.exception))
+
     def test_a_view_layer_is_chosen_among_several(self) -> None:
         names = [f"{layer}.{name}" for layer in ("Glass", "Wood") for name in CYCLES]
         self.write(self.planes(names))

@@ -12,7 +12,7 @@ DEAD = 4199999999  # Above the largest process id.
 
 
 def temporary(name, process):
-    """What a process of this computer calls the file while it writes it (`demc_data::file`)."""
+    """What a process of this computer calls the file while it writes it (`demc_program::file`)."""
     with open("/proc/sys/kernel/random/boot_id") as boot:
         host = f"{boot.read(8)}-{os.stat('/proc/self/ns/pid').st_ino}"
     return f".{name}.{host}-{process}.tmp"

@@ -1,32 +1,58 @@
 //! `demc-data doctor`.
 
 use std::fmt::Write;
-use std::path::Path;
+use std::path::PathBuf;
 
-use crate::doctor::{Affected, Problem, Report, examine};
-use crate::message::{self, printable};
 use anyhow::Result;
+use clap::Args;
+use demc_program::exit;
+use demc_program::message::{self, printable};
+
+use crate::check::doctor::{Affected, Problem, Report, examine};
+
+#[derive(Args)]
+#[command(after_help = "Example:\n  demc-data doctor data/sample")]
+pub struct Arguments {
+    /// Directory of the data set, with its manifest.json
+    #[arg(value_name = "DIR")]
+    root: PathBuf,
+    /// Channel layout: a preset or a TOML file; by default the preset that fits the first file
+    #[arg(long, value_name = "PRESET|FILE")]
+    layout: Option<String>,
+    /// Patch size of training in pixels
+    #[arg(long, default_value_t = 128, value_name = "PIXELS")]
+    patch_size: usize,
+    /// Print one JSON object instead of lines
+    #[arg(long)]
+    json: bool,
+}
 
 /// Scenes that are named for a problem; the others are counted.
 const NAMED: usize = 4;
 
-/// Prints one line per problem and a summary, or one JSON object.
-pub fn run(root: &Path, layout: Option<&str>, patch_size: usize, json: bool) -> Result<u8> {
-    if root.is_dir() && !root.join("manifest.json").exists() {
-        anyhow::bail!(
-            "{} has no manifest.json; run `demc-data index {0}` to write it",
-            root.display()
-        );
+impl Arguments {
+    /// Prints one line per problem and a summary, or one JSON object.
+    pub fn run(&self) -> Result<u8> {
+        let root = &self.root;
+        if root.is_dir() && !root.join("manifest.json").exists() {
+            anyhow::bail!(
+                "{} has no manifest.json; run `demc-data index {0}` to write it",
+                root.display()
+            );
+        }
+        let report = examine(root, self.layout.as_deref(), self.patch_size)?;
+        let text = if self.json {
+            message::json(&report)?
+        } else {
+            lines(&report)
+        };
+        message::result(&text)?;
+        Ok(if report.problems.is_empty() {
+            exit::SUCCESS
+        } else {
+            exit::FAILURE
+        })
     }
-    let report = examine(root, layout, patch_size)?;
-    message::result(&match json {
-        true => message::json(&report)?,
-        false => lines(&report),
-    })?;
-    Ok(match report.problems.is_empty() {
-        true => 0,
-        false => 1,
-    })
 }
 
 fn lines(report: &Report) -> String {
@@ -51,12 +77,15 @@ fn lines(report: &Report) -> String {
 
 /// `problem: scene (detail), scene (detail) and 3 more; cause`.
 fn line(problem: &Problem) -> String {
-    let named = problem.scenes.iter().take(NAMED);
-    let named = named.map(|Affected { scene, detail }| match detail.is_empty() {
-        true => scene.clone(),
-        false => format!("{scene} ({detail})"),
-    });
-    let mut scenes = named.collect::<Vec<_>>().join(", ");
+    let name = |Affected { scene, detail }: &Affected| {
+        if detail.is_empty() {
+            scene.clone()
+        } else {
+            format!("{scene} ({detail})")
+        }
+    };
+    let named: Vec<String> = problem.scenes.iter().take(NAMED).map(name).collect();
+    let mut scenes = named.join(", ");
     if let Some(more @ 1..) = problem.scenes.len().checked_sub(NAMED) {
         // Writing to a String cannot fail.
         let _ = write!(scenes, " and {more} more");

@@ -3,12 +3,27 @@
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use crate::channel::{Channel, ChannelType};
-use crate::exr::ExrFile;
-use crate::message::{self, printable};
-use crate::plane::Plane;
 use anyhow::Result;
+use clap::Args;
+use demc_program::exit;
+use demc_program::message::{self, printable};
 use serde::Serialize;
+
+use super::number::number;
+use crate::image::channel::{Channel, ChannelType};
+use crate::image::exr::ExrFile;
+use crate::image::plane::Plane;
+
+#[derive(Args)]
+#[command(after_help = "Example:\n  demc-data inspect data/sample/train/*.exr")]
+pub struct Arguments {
+    /// OpenEXR files: half, float or uint channels, one part or several, scan lines or tiles
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// Print one JSON array instead of tables
+    #[arg(long)]
+    json: bool,
+}
 
 #[derive(Serialize)]
 struct ChannelRow {
@@ -35,32 +50,34 @@ struct FileReport {
     channels: Vec<ChannelRow>,
 }
 
-/// Prints a table per file, or one JSON array. A file that cannot be read gives one error line and,
-/// at the end, a failure status; the other files are still inspected.
-pub fn run(files: &[PathBuf], json: bool) -> Result<u8> {
-    let mut reports = Vec::new();
-    let mut status = 0;
-    for file in files {
-        let channels = match rows(file) {
-            Ok(channels) => channels,
-            Err(error) => {
-                super::report(&error);
-                status = 1;
-                continue;
+impl Arguments {
+    /// Prints a table per file, or one JSON array. A file that cannot be read gives one error line and,
+    /// at the end, a failure status; the other files are still inspected.
+    pub fn run(&self) -> Result<u8> {
+        let mut reports = Vec::new();
+        let mut status = exit::SUCCESS;
+        for file in &self.files {
+            let channels = match rows(file) {
+                Ok(channels) => channels,
+                Err(error) => {
+                    demc_program::cli::report(&error);
+                    status = exit::FAILURE;
+                    continue;
+                }
+            };
+            let file = file.display().to_string();
+            let report = FileReport { file, channels };
+            if self.json {
+                reports.push(report);
+            } else {
+                message::result(&table(&report))?;
             }
-        };
-        let file = file.display().to_string();
-        let report = FileReport { file, channels };
-        if json {
-            reports.push(report);
-        } else {
-            message::result(&table(&report))?;
         }
+        if self.json {
+            message::result(&message::json(&reports)?)?;
+        }
+        Ok(status)
     }
-    if json {
-        message::result(&message::json(&reports)?)?;
-    }
-    Ok(status)
 }
 
 fn rows(path: &Path) -> Result<Vec<ChannelRow>> {
@@ -122,9 +139,7 @@ fn table(report: &FileReport) -> String {
     );
     for row in rows {
         let [min, max, mean] = match &row.range {
-            Some(range) => {
-                [f64::from(range.min), f64::from(range.max), range.mean].map(super::number)
-            }
+            Some(range) => [f64::from(range.min), f64::from(range.max), range.mean].map(number),
             None => ["-"; 3].map(str::to_owned),
         };
         let _ = write!(

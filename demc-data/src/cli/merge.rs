@@ -3,13 +3,33 @@
 use std::ffi::OsString;
 use std::path::PathBuf;
 
-use crate::exr::ExrFile;
-use crate::exr::merge::{MergeInput, merge};
-use crate::message::{self, printable};
-use crate::output::{Directories, Outputs};
 use anyhow::Result;
+use clap::Args;
+use demc_program::exit::{self, UsageError};
+use demc_program::message::{self, printable};
+use demc_program::output::{Directories, Outputs};
 
-use super::{MergeArguments, UsageError};
+use crate::image::exr::ExrFile;
+use crate::image::exr::merge::{MergeInput, merge};
+
+#[derive(Args)]
+#[command(
+    after_help = "Example:\n  demc-data merge -o scene.exr noisy.exr albedo=noisy.albedo.exr ref=reference.exr"
+)]
+pub struct Arguments {
+    /// The file to write
+    #[arg(short, long, value_name = "OUT.exr")]
+    output: PathBuf,
+    /// Files to join; a path with `=` in its first directory or name is written as `./PATH`
+    #[arg(required = true, value_name = "[NAME=]FILE")]
+    files: Vec<OsString>,
+    /// Remove `LAYER.` from the channel names of files with a NAME, such as ViewLayer.Combined
+    #[arg(long, value_name = "LAYER")]
+    strip: Option<String>,
+    /// Replace an existing output
+    #[arg(long)]
+    overwrite: bool,
+}
 
 /// A file argument: `FILE` or `NAME=FILE`.
 #[derive(Debug, PartialEq, Eq)]
@@ -18,56 +38,61 @@ struct Source {
     path: PathBuf,
 }
 
-/// Joins the files and prints one line.
-pub fn run(args: &MergeArguments) -> Result<()> {
-    let output = args.output.as_path();
-    let files = args.files.iter();
-    let sources: Vec<Source> = files.map(Source::parse).collect::<Result<_, _>>()?;
-    let mut outputs = Outputs::default();
-    for Source { path, .. } in &sources {
-        outputs.protect(path, &format!("the input {}", path.display()));
-    }
-    outputs.claim(output, args.overwrite)?;
-    outputs.prepare(Directories::Expect)?;
-    let mut inputs = Vec::with_capacity(sources.len());
-    for Source { prefix, path } in sources {
-        let file = ExrFile::open(&path)?;
-        // Files without a name keep their channels' names.
-        let strip = args.strip.clone().filter(|_| prefix.is_some());
-        inputs.push(MergeInput {
-            file,
-            prefix,
-            strip,
-        });
-    }
-    if let Some(strip) = &args.strip {
-        let start = format!("{strip}.");
-        let named = inputs.iter().filter(|input| input.prefix.is_some());
-        let mut channels = named.flat_map(|input| input.file.channels());
-        if !channels.any(|channel| channel.name.starts_with(&start)) {
-            return Err(UsageError(format!(
-                "--strip {}: no channel of a file with a NAME starts with it",
-                printable(strip)
-            ))
-            .into());
+impl Arguments {
+    /// Joins the files and prints one line.
+    pub fn run(&self) -> Result<u8> {
+        let output = self.output.as_path();
+        let sources: Vec<Source> = self
+            .files
+            .iter()
+            .map(Source::parse)
+            .collect::<Result<_, _>>()?;
+        let mut outputs = Outputs::default();
+        for Source { path, .. } in &sources {
+            outputs.protect(path, &format!("the input {}", path.display()));
         }
+        outputs.claim(output, self.overwrite)?;
+        outputs.prepare(Directories::Expect)?;
+        let mut inputs = Vec::with_capacity(sources.len());
+        for Source { prefix, path } in sources {
+            let file = ExrFile::open(&path)?;
+            // Files without a name keep their channels' names.
+            let strip = self.strip.clone().filter(|_| prefix.is_some());
+            inputs.push(MergeInput {
+                file,
+                prefix,
+                strip,
+            });
+        }
+        if let Some(strip) = &self.strip {
+            let start = format!("{strip}.");
+            let named = inputs.iter().filter(|input| input.prefix.is_some());
+            let mut channels = named.flat_map(|input| input.file.channels());
+            if !channels.any(|channel| channel.name.starts_with(&start)) {
+                return Err(UsageError(format!(
+                    "--strip {}: no channel of a file with a NAME starts with it",
+                    printable(strip)
+                ))
+                .into());
+            }
+        }
+        let merged = merge(&mut inputs, output)?;
+        if !merged.conflicts.is_empty() {
+            let names = merged.conflicts.join(", ");
+            message::say(format_args!(
+                "note: the files differ in {names}; the first value is kept"
+            ));
+        }
+        let summary = format!(
+            "{}: {} channels of {} files: {}",
+            output.display(),
+            merged.channels.len(),
+            inputs.len(),
+            merged.channels.join(", ")
+        );
+        message::status(printable(&summary));
+        Ok(exit::SUCCESS)
     }
-    let merged = merge(&mut inputs, output)?;
-    if !merged.conflicts.is_empty() {
-        let names = merged.conflicts.join(", ");
-        message::say(format_args!(
-            "note: the files differ in {names}; the first value is kept"
-        ));
-    }
-    let summary = format!(
-        "{}: {} channels of {} files: {}",
-        output.display(),
-        merged.channels.len(),
-        inputs.len(),
-        merged.channels.join(", ")
-    );
-    message::status(printable(&summary));
-    Ok(())
 }
 
 impl Source {

@@ -2,17 +2,43 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
-use std::path::Path;
+use std::path::PathBuf;
 
-use crate::frame::FEATURE_NAMES;
-use crate::message::{self, printable};
-use crate::patch::patches;
-use crate::{ChannelLayout, DataConfig, Dataset, Scene, Split, Statistics};
 use anyhow::Result;
+use clap::Args;
+use demc_program::exit;
+use demc_program::message::{self, printable};
 use serde::Serialize;
+
+use super::number::number;
+use crate::dataset::{Dataset, Scene, Split};
+use crate::image::frame::FEATURE_NAMES;
+use crate::image::layout::ChannelLayout;
+use crate::training::config::DataConfig;
+use crate::training::patch::patches;
+use crate::training::stats::Statistics;
 
 /// Epsilon of Eq. 5 (Sec. 4.2).
 const RELMSE_EPSILON: f32 = 0.001;
+
+#[derive(Args)]
+#[command(
+    after_help = "Examples:\n  demc-data stats data/sample\n  demc-data stats renders --layout my-renderer.toml --json"
+)]
+pub struct Arguments {
+    /// Directory of the data set, with its manifest.json
+    #[arg(value_name = "DIR")]
+    root: PathBuf,
+    /// Channel layout: demc-exr, mitsuba3, pbrt-v4, cycles, luxcore, fbksd, or a TOML file
+    #[arg(long, default_value = "demc-exr")]
+    layout: String,
+    /// The split to measure
+    #[arg(long, default_value = "train", value_parser = parse_split, value_name = "train|test")]
+    split: Split,
+    /// Print one JSON object instead of a table
+    #[arg(long)]
+    json: bool,
+}
 
 #[derive(Serialize)]
 struct DatasetReport<'a> {
@@ -48,43 +74,62 @@ struct FeatureRow {
     std: f32,
 }
 
-/// Measures the data set at `root` and prints a table or a JSON object.
-pub fn run(root: &Path, layout_name: &str, split: Split, json: bool) -> Result<()> {
-    let layout = ChannelLayout::resolve(layout_name)?;
-    let dataset = Dataset::open(root, &layout)?;
-    let config = DataConfig::default();
-    let scenes = dataset.split(split)?;
-    let measured = Statistics::measure(&scenes, &layout, &config, RELMSE_EPSILON)?;
-    let splits = [Split::Train, Split::Test].into_iter().filter_map(|split| {
-        let scenes = dataset.split(split).ok()?;
-        Some((split, contents(&scenes, &config)))
-    });
-    let normalizer = measured.normalizer;
-    let stats = normalizer
-        .features
-        .mean
-        .into_iter()
-        .zip(normalizer.features.std);
-    let report = DatasetReport {
-        root: root.display().to_string(),
-        layout: layout_name,
-        splits: splits.collect(),
-        split,
-        pixels: measured.pixels,
-        misses: measured.misses as f64 / measured.pixels as f64,
-        negative: measured.clamped,
-        features: FEATURE_NAMES
+impl Arguments {
+    /// Measures the data set and prints a table or a JSON object.
+    pub fn run(&self) -> Result<u8> {
+        let Self {
+            root,
+            layout: layout_name,
+            split,
+            json,
+        } = self;
+        let split = *split;
+        let layout = ChannelLayout::resolve(layout_name)?;
+        let dataset = Dataset::open(root, &layout)?;
+        let config = DataConfig::default();
+        let scenes = dataset.split(split)?;
+        let measured = Statistics::measure(&scenes, &layout, &config, RELMSE_EPSILON)?;
+        let splits = [Split::Train, Split::Test].into_iter().filter_map(|split| {
+            let scenes = dataset.split(split).ok()?;
+            Some((split, contents(&scenes, &config)))
+        });
+        let normalizer = measured.normalizer;
+        let stats = normalizer
+            .features
+            .mean
             .into_iter()
-            .zip(stats)
-            .map(|(name, (mean, std))| FeatureRow { name, mean, std })
-            .collect(),
-        flat_color: normalizer.flat_color,
-    };
-    let text = match json {
-        true => message::json(&report)?,
-        false => table(&report, &config),
-    };
-    Ok(message::result(&text)?)
+            .zip(normalizer.features.std);
+        let report = DatasetReport {
+            root: root.display().to_string(),
+            layout: layout_name,
+            splits: splits.collect(),
+            split,
+            pixels: measured.pixels,
+            misses: measured.misses as f64 / measured.pixels as f64,
+            negative: measured.clamped,
+            features: FEATURE_NAMES
+                .into_iter()
+                .zip(stats)
+                .map(|(name, (mean, std))| FeatureRow { name, mean, std })
+                .collect(),
+            flat_color: normalizer.flat_color,
+        };
+        let text = if *json {
+            message::json(&report)?
+        } else {
+            table(&report, &config)
+        };
+        message::result(&text)?;
+        Ok(exit::SUCCESS)
+    }
+}
+
+fn parse_split(text: &str) -> Result<Split, String> {
+    match text {
+        "train" => Ok(Split::Train),
+        "test" => Ok(Split::Test),
+        _ => Err("expected train or test".to_owned()),
+    }
 }
 
 fn contents(scenes: &[Scene], config: &DataConfig) -> SplitContents {
@@ -141,10 +186,7 @@ fn table(report: &DatasetReport<'_>, config: &DataConfig) -> String {
     );
     let _ = writeln!(text, "  {:10}  {:>11}  {:>11}", "feature", "mean", "std");
     for FeatureRow { name, mean, std } in &report.features {
-        let (mean, std) = (
-            super::number(f64::from(*mean)),
-            super::number(f64::from(*std)),
-        );
+        let (mean, std) = (number(f64::from(*mean)), number(f64::from(*std)));
         let _ = writeln!(text, "  {name:10}  {mean:>11}  {std:>11}");
     }
     let [r, g, b] = report.flat_color;

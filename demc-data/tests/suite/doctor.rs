@@ -1,4 +1,4 @@
-//! Damaged copies of sample scenes, and what `demc_data::doctor` finds in them.
+//! Damaged copies of sample scenes, and what `demc_data::check::doctor` finds in them.
 
 use std::collections::BTreeMap;
 use std::fs;

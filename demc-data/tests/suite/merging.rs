@@ -1,4 +1,4 @@
-//! Files joined by `demc_data::exr::merge`: bits, types, attributes, and refusals.
+//! Files joined by `demc_data::image::exr::merge`: bits, types, attributes, and refusals.
 
 use std::fs;
 use std::path::{Path, PathBuf};

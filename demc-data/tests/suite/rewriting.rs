@@ -95,7 +95,7 @@ fn threads_and_cached_blocks_do_not_change_the_output() {
         for threads in [1, 3, 100] {
             // Memory for no blocks, for some, and for all.
             for room in [0, 5_000_000, usize::MAX] {
-                let mut file = open(threads).keeping(&layout, room);
+                let mut file = open(threads).keeping(&layout.color, room);
                 // Twice from one file, which is read again.
                 for _ in 0..2 {
                     let again = frame::decode_input(&mut file, &layout).expect("sound");

@@ -3,8 +3,8 @@
 use std::fs;
 use std::path::Path;
 
-use demc_data::exr::ExrFile;
-use demc_data::plane::Plane;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::plane::Plane;
 use demc_data::{Error, SamplePrecision, write_rgb};
 
 const SIZE: (usize, usize) = (7, 5);
@@ -119,7 +119,7 @@ fn special_files_are_refused_and_stay_unchanged() {
             error.to_string(),
             format!("cannot write {}", path.display())
         );
-        let Error::Write { source, .. } = error else {
+        let Error::File(demc_program::file::FileError::Write { source, .. }) = error else {
             panic!("{error:?}");
         };
         assert_eq!(source.kind(), std::io::ErrorKind::InvalidInput);

@@ -1,9 +1,9 @@
 //! A frame from images in memory.
 
-use demc_data::exr::check_size;
-use demc_data::frame::{FEATURES, POSITIONS};
-use demc_data::layout::Missing;
-use demc_data::{Frame, frame};
+use demc_data::Frame;
+use demc_data::image::exr::check_size;
+use demc_data::image::frame::{self, FEATURES, POSITIONS};
+use demc_data::image::layout::Missing;
 
 use super::{BufferError, View};
 use crate::Bundle;

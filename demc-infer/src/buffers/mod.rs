@@ -33,7 +33,7 @@ mod view;
 pub use frame::Buffers;
 pub use view::{Sample, View, ViewMut, extent};
 
-use demc_data::exr::UnsupportedSize;
+use demc_data::image::exr::UnsupportedSize;
 
 /// Why images in memory cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

@@ -1,6 +1,6 @@
 //! Views with every kind of strides, and frames made of them.
 
-use demc_data::layout::Missing;
+use demc_data::image::layout::Missing;
 use demc_model::Variant;
 use half::f16;
 

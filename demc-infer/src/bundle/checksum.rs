@@ -7,8 +7,8 @@
 
 use std::path::Path;
 
-use demc_data::checksum::sha256;
-use demc_data::message::printable;
+use demc_program::checksum::sha256;
+use demc_program::message::printable;
 use safetensors::SafeTensors;
 
 use super::BundleError;

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use demc_model::WeightsError;
+use demc_program::file::FileError;
 
 use super::FORMAT;
 
@@ -19,7 +20,7 @@ pub enum BundleError {
     },
     /// The file cannot be written.
     #[error(transparent)]
-    Write(#[from] demc_data::Error),
+    Write(#[from] FileError),
     /// A directory that is neither a run nor a checkpoint.
     #[error(
         "{}: neither a run directory nor a checkpoint: it has no best.safetensors, latest or model.safetensors",

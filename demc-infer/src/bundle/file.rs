@@ -5,10 +5,10 @@ use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
-use demc_data::frame::FEATURE_NAMES;
-use demc_data::message::printable;
+use demc_data::image::frame::FEATURE_NAMES;
 use demc_model::kernel_head::GAMMA;
 use demc_model::{Head, Weight};
+use demc_program::message::printable;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, Metadata};
 use serde::Deserialize;

@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use demc_data::message::printable;
 use demc_model::{ModelConfig, Role, Weight, WeightSpec};
+use demc_program::message::printable;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 

@@ -26,7 +26,7 @@ use std::io::Write;
 use std::path::Path;
 
 use burn::tensor::Device;
-use demc_data::layout::{Missing, MissingPolicies};
+use demc_data::image::layout::{Missing, MissingPolicies};
 use demc_data::{ChannelLayout, Normalizer, Ranges};
 use demc_model::{Denoiser, ModelConfig, Weights, WeightsError};
 use serde::{Deserialize, Serialize};
@@ -129,7 +129,7 @@ impl Bundle {
     /// A weight beyond f16's range (nothing is written), or a path that cannot be written.
     pub fn save(&self, path: &Path, names: Names, precision: Precision) -> Result<(), BundleError> {
         let bytes = self.to_bytes(names, precision)?;
-        demc_data::file::write_whole(path, |file| file.write_all(&bytes))?;
+        demc_program::file::write_whole(path, |file| file.write_all(&bytes))?;
         Ok(())
     }
 

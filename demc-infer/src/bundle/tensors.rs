@@ -2,8 +2,8 @@
 
 use std::collections::HashMap;
 
-use demc_data::message::printable;
 use demc_model::Weight;
+use demc_program::message::printable;
 use half::f16;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 

@@ -2,15 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::Bundle;
 use clap::Args;
-use demc_data::exr::ExrFile;
-use demc_data::frame::{FEATURE_NAMES, TEXTURES, decode_input};
-use demc_data::message::{self, printable};
-use demc_data::noise::{CORRELATED, correlation};
-use demc_data::ranges::Range;
-use demc_data::transform::MAX_ALBEDO;
+use demc_data::check::noise::{CORRELATED, correlation};
+use demc_data::image::exr::ExrFile;
+use demc_data::image::frame::{FEATURE_NAMES, TEXTURES, decode_input};
+use demc_data::input::ranges::Range;
+use demc_data::input::transform::MAX_ALBEDO;
 use demc_data::{Frame, FrameSummary};
+use demc_program::message::{self, printable};
 use serde::Serialize;
 
 use super::flags::{DeviceFlag, ModelFlag};
@@ -18,6 +17,7 @@ use super::frames::Frames;
 use super::inputs::Inputs;
 use super::layouts::{LayoutFlags, Layouts, say};
 use super::{Clamped, utf8_for_json};
+use crate::Bundle;
 
 /// Compare images with a model's training data: statistics of each channel, and warnings.
 ///

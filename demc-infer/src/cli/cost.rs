@@ -2,16 +2,16 @@
 
 use std::path::PathBuf;
 
-use crate::{Bundle, Ensemble, Tiling, memory};
 use clap::Args;
-use demc_data::exr::{ExrFile, check_size};
-use demc_data::frame::{Presence, check_open_header};
-use demc_data::message;
+use demc_data::image::exr::{ExrFile, check_size};
+use demc_data::image::frame::{Presence, check_open_header};
 use demc_model::{DOWNSAMPLING, ModelConfig};
+use demc_program::message;
 use serde::Serialize;
 
 use super::flags::{DeviceFlag, ModelFlag, TilingFlags, describe};
 use super::layouts::{LayoutFlags, say};
+use crate::{Bundle, Ensemble, Tiling, memory};
 
 /// Show the cost of denoising: parameters, operations, memory and tiles. Nothing is denoised.
 #[derive(Args)]

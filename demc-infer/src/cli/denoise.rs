@@ -3,15 +3,13 @@
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use crate::denoise::{DenoiseOptions, DenoiseProgress, SeamError};
-use crate::guard::{EnergyBias, Warning};
-use crate::{Bundle, Picture, memory};
 use clap::{Args, ValueEnum};
-use demc_data::exr::rewrite::{OutputChannels, WriteOptions, rewrite_with_layers};
-use demc_data::exr::{Compression, ExrFile};
-use demc_data::frame::{decode_input, decode_repaired};
-use demc_data::output::{Directories, Outputs};
-use demc_data::{ChannelLayout, message};
+use demc_data::ChannelLayout;
+use demc_data::image::exr::{Compression, ExrFile};
+use demc_data::image::frame::{decode_input, decode_repaired};
+use demc_data::image::rewrite::{OutputChannels, WriteOptions, rewrite_with_layers};
+use demc_program::message;
+use demc_program::output::{Directories, Outputs};
 
 use super::Clamped;
 use super::exposure::{InputScaleFlag, SequenceScales, stops};
@@ -24,6 +22,9 @@ use super::layouts::{LayoutFlags, Layouts};
 use super::progress::Progress;
 use super::shard::Shard;
 use super::warnings::Warnings;
+use crate::denoise::{DenoiseOptions, DenoiseProgress, SeamError};
+use crate::guard::{EnergyBias, Warning};
+use crate::{Bundle, Picture, memory};
 
 /// Largest cache of an input's decoded blocks in bytes, kept until its output is written (ours:
 /// three times 19 half channels of 1920x1080). Blocks beyond it are decompressed twice.
@@ -205,7 +206,7 @@ impl Arguments {
         let say = |choice: &str| progress.line(format_args!("note: {name}: {choice}"));
         let layout = &layouts.of(&file, bundle, say)?;
         let names = self.layers.names(&file, layout)?;
-        let mut file = file.keeping(layout, cache_bytes());
+        let mut file = file.keeping(&layout.color, cache_bytes());
         let (mut frame, repaired) = match self.repair {
             false => (decode_input(&mut file, layout)?, 0),
             true => decode_repaired(&mut file, layout)?,

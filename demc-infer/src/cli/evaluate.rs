@@ -2,15 +2,15 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::Report;
-use crate::evaluate::Difference;
 use clap::Args;
-use demc_data::message;
 use demc_model::metrics::{self, METRICS, Metric};
+use demc_program::message;
 use serde::Serialize;
 
 use super::UsageError;
 use super::scenes::Scenes;
+use crate::Report;
+use crate::evaluate::Difference;
 
 /// Score a model on images with references: RelMSE and SSIM of the noisy, an all-black and the
 /// denoised image.

@@ -3,18 +3,18 @@
 use std::env;
 use std::path::{Path, PathBuf};
 
-use crate::bundle::locate;
-use crate::verify::{KERNEL_TOLERANCE, Runtime, TOLERANCE, verify};
-use crate::{Bundle, BundleFile, Names, Precision};
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
 use demc_data::ChannelLayout;
-use demc_data::message::{self, printable};
-use demc_data::output::Outputs;
+use demc_program::message::{self, printable};
+use demc_program::output::Outputs;
 
 use super::flags::ModelFlag;
 use super::layouts::LAYOUT;
 use super::{UsageError, check_output};
+use crate::bundle::locate;
+use crate::verify::{KERNEL_TOLERANCE, Runtime, TOLERANCE, verify};
+use crate::{Bundle, BundleFile, Names, Precision};
 
 /// Variable with the interpreter for `--verify`.
 const PYTHON_VARIABLE: &str = "DEMC_PYTHON";

@@ -4,14 +4,14 @@ use std::collections::HashMap;
 use std::path::Path;
 use std::str::FromStr;
 
-use crate::Bundle;
-use crate::denoise::MAX_INPUT_SCALE;
 use clap::Args;
-use demc_data::exr::ExrFile;
-use demc_data::ranges::exposure;
+use demc_data::image::exr::ExrFile;
+use demc_data::input::ranges::exposure;
 
 use super::inputs::Sequence;
 use super::layouts::Layouts;
+use crate::Bundle;
+use crate::denoise::MAX_INPUT_SCALE;
 
 /// `--input-scale`.
 #[derive(Args)]

@@ -2,15 +2,15 @@
 
 use std::path::PathBuf;
 
+use clap::Args;
+use demc_data::image::exr::MAX_SIDE;
+use demc_program::output::Outputs;
+
+use super::UsageError;
 use crate::bundle::locate;
 use crate::compute::ComputeFlags;
 use crate::tiles::EXACT_HALO;
 use crate::{Bundle, BundleError, BundleFile, Bundled, Ensemble, Tiles, Tiling, device};
-use clap::Args;
-use demc_data::exr::MAX_SIDE;
-use demc_data::output::Outputs;
-
-use super::UsageError;
 
 /// `--model`.
 #[derive(Args)]

@@ -2,14 +2,14 @@
 
 use std::path::PathBuf;
 
-use crate::bundle::locate;
-use crate::{BundleError, BundleFile, Names, Precision};
 use burn::tensor::Device;
 use clap::Args;
-use demc_data::message::{self, printable};
-use demc_data::output::Outputs;
+use demc_program::message::{self, printable};
+use demc_program::output::Outputs;
 
 use super::check_output;
+use crate::bundle::locate;
+use crate::{BundleError, BundleFile, Names, Precision};
 
 /// Import weights that were trained in PyTorch with the package of python/.
 ///

@@ -4,7 +4,7 @@ use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use demc_data::message;
+use demc_program::message;
 
 use super::UsageError;
 use super::frames::Frames;

@@ -2,17 +2,17 @@
 
 use std::fmt::Write;
 
-use crate::{Bundle, BundleMeta, Names, Precision};
 use burn::tensor::Device;
 use clap::Args;
 use demc_data::ChannelLayout;
-use demc_data::frame::FEATURE_NAMES;
-use demc_data::layout::Missing;
-use demc_data::message::{self, printable};
+use demc_data::image::frame::FEATURE_NAMES;
+use demc_data::image::layout::Missing;
+use demc_program::message::{self, printable};
 use serde::Serialize;
 
 use super::flags::ModelFlag;
 use super::utf8_for_json;
+use crate::{Bundle, BundleMeta, Names, Precision};
 
 /// Show a model: network, training step, statistics and input channels.
 ///

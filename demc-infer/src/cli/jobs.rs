@@ -5,7 +5,7 @@ use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use demc_data::output::{OutputError, Outputs};
+use demc_program::output::{OutputError, Outputs};
 
 use super::UsageError;
 use super::inputs::Inputs;

@@ -1,15 +1,15 @@
 //! `--layers`: further channels of a file that are denoised beside its colour.
 
-use crate::denoise::Layer;
-use crate::{Bundle, Ensemble};
 use clap::Args;
-use demc_data::exr::ExrFile;
-use demc_data::frame::layers::{check_layers, decode_layers};
-use demc_data::message::list;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::frame::layers::{check_layers, decode_layers};
 use demc_data::{ChannelLayout, Error};
+use demc_program::message::list;
 use glob::Pattern;
 
 use super::UsageError;
+use crate::denoise::Layer;
+use crate::{Bundle, Ensemble};
 
 /// `--layers`.
 #[derive(Args)]

@@ -3,14 +3,15 @@
 use std::cell::RefCell;
 use std::path::Path;
 
-use crate::Bundle;
 use clap::Args;
-use demc_data::exr::ExrFile;
-use demc_data::layout::{FileLayout, Missing, detect};
-use demc_data::output::Outputs;
-use demc_data::{ChannelLayout, Dataset, Error, message};
+use demc_data::image::exr::ExrFile;
+use demc_data::image::layout::{FileLayout, Missing, detect};
+use demc_data::{ChannelLayout, Dataset, Error};
+use demc_program::message;
+use demc_program::output::Outputs;
 
 use super::UsageError;
+use crate::Bundle;
 
 /// What a layout file is called in messages about outputs.
 pub const LAYOUT: &str = "the channel layout";

@@ -27,9 +27,9 @@ use std::ffi::OsString;
 use std::path::Path;
 
 use clap::{CommandFactory, Parser, Subcommand};
-use demc_data::message;
-use demc_data::message::UsageError;
-use demc_data::output::{Directories, OutputError, Outputs};
+use demc_program::exit::{self, UsageError};
+use demc_program::message;
+use demc_program::output::{Directories, OutputError, Outputs};
 
 use crate::compute;
 
@@ -73,26 +73,10 @@ pub fn run_command(arguments: impl IntoIterator<Item = OsString>) -> anyhow::Res
 
 /// Runs the program with its name and arguments. Returns the exit code.
 pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
-    let arguments = match Arguments::try_parse_from(arguments) {
-        Ok(arguments) => arguments,
-        Err(shown) => return message::usage(&shown),
-    };
-    if let Some(note) = &demc_data::parallel::threads().note {
-        message::say(format_args!("note: {note}"));
-    }
-    let done = compute::on_threads(|| run(arguments));
-    match done.map_err(anyhow::Error::from).flatten() {
-        Ok(()) => 0,
-        Err(error) => {
-            message::say(format_args!("error: {error:#}"));
-            let refused = error.downcast_ref().is_some_and(OutputError::is_usage);
-            if error.is::<UsageError>() || refused {
-                2
-            } else {
-                1
-            }
-        }
-    }
+    demc_program::cli::main(arguments, |arguments: Arguments| {
+        compute::on_threads(|| run(arguments))??;
+        Ok(exit::SUCCESS)
+    })
 }
 
 fn run(arguments: Arguments) -> anyhow::Result<()> {
@@ -153,7 +137,7 @@ fn write_text(path: &Path, text: &str) -> anyhow::Result<()> {
     if path == Path::new("-") {
         return Ok(message::result(text)?);
     }
-    demc_data::file::write_whole(path, |file| {
+    demc_program::file::write_whole(path, |file| {
         std::io::Write::write_all(file, format!("{text}\n").as_bytes())
     })?;
     Ok(())

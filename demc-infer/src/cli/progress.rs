@@ -2,7 +2,7 @@
 
 use std::fmt::Display;
 
-use demc_data::message;
+use demc_program::message;
 use indicatif::{ProgressBar, ProgressStyle};
 
 pub struct Progress(ProgressBar);

@@ -3,11 +3,11 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use crate::report::{About, ReportPage};
 use clap::Args;
-use demc_data::message::{self, printable};
+use demc_program::message::{self, printable};
 
 use super::scenes::{Scenes, require_all};
+use crate::report::{About, ReportPage};
 
 /// Write an HTML report: denoised images beside noisy, reference and baseline images, with all
 /// metrics.
@@ -46,7 +46,7 @@ impl Arguments {
             split: demc_data::Split::from(self.scenes.split).to_string(),
         };
         let html = page.html(&about, &report)?;
-        demc_data::file::write_whole(&self.output, |file| file.write_all(html.as_bytes()))?;
+        demc_program::file::write_whole(&self.output, |file| file.write_all(html.as_bytes()))?;
         let summary = format!(
             "{}: {} images, {:.1} MB",
             self.output.display(),

@@ -2,20 +2,20 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::denoise::{DenoiseError, DenoiseOptions, Denoised, unobserved};
-use crate::evaluate::FailedImage;
-use crate::report::SceneImages;
-use crate::{Baseline, BaselineError, Ensemble, ImageScore, Report, baseline};
 use clap::{Args, ValueEnum};
-use demc_data::message::printable;
-use demc_data::output::Outputs;
 use demc_data::{ChannelLayout, Dataset, Frame, Rgb, Scene};
+use demc_program::message::printable;
+use demc_program::output::Outputs;
 
 use super::exposure::InputScaleFlag;
 use super::flags::{DeviceFlag, EnsembleFlag, LightFlag, ModelFlag};
 use super::layouts::LayoutFlags;
 use super::progress::Progress;
 use super::{Clamped, UsageError};
+use crate::denoise::{DenoiseError, DenoiseOptions, Denoised, unobserved};
+use crate::evaluate::FailedImage;
+use crate::report::SceneImages;
+use crate::{Baseline, BaselineError, Ensemble, ImageScore, Report, baseline};
 
 /// The model, the scenes and the baselines.
 #[derive(Args)]
@@ -85,7 +85,7 @@ impl Scenes {
         let mut outputs = Outputs::default();
         self.model.protect(&mut outputs);
         self.layout.protect(&mut outputs);
-        let scenes = outputs.protect_dataset(&self.data)?;
+        let scenes = Dataset::protect(&self.data, &mut outputs)?;
         for baseline in &self.baselines {
             let what = format!("an image of baseline {}", baseline.name);
             for scene in &scenes {

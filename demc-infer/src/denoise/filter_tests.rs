@@ -1,6 +1,6 @@
 //! Tests of the albedo filter with narrow networks on frames with a pattern.
 
-use demc_data::frame::TEXTURES;
+use demc_data::image::frame::TEXTURES;
 use demc_data::{Frame, PositionSpace};
 use demc_model::Variant;
 

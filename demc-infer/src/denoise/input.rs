@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
-use demc_data::frame::TEXTURES;
-use demc_data::transform::exposure_scale;
+use demc_data::image::frame::TEXTURES;
+use demc_data::input::transform::exposure_scale;
 use demc_data::{FEATURES, Frame, PositionMap};
 use demc_model::Head;
 use demc_model::config::COLOR_CHANNELS;
@@ -168,7 +168,7 @@ impl<'a> FrameInput<'a> {
         let grey = alpha.repeat(COLOR_CHANNELS);
         let input = FrameInput {
             color: &grey,
-            scale: exposure_scale(ALPHA_LEVEL, demc_data::ranges::exposure(&grey)),
+            scale: exposure_scale(ALPHA_LEVEL, demc_data::input::ranges::exposure(&grey)),
             demodulate: false,
             ..self.clone()
         };

@@ -1,7 +1,7 @@
 //! Tests of layers with a narrow network on frames with a pattern.
 
 use demc_data::Frame;
-use demc_data::frame::TEXTURES;
+use demc_data::image::frame::TEXTURES;
 use demc_model::{Head, Ops, Variant};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;

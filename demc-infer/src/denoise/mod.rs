@@ -17,20 +17,19 @@ use std::ops::ControlFlow;
 
 use burn::module::Module;
 use burn::tensor::Device;
-use demc_data::transform::exposure_scale;
+use demc_data::input::transform::exposure_scale;
 use demc_data::{FEATURES, Frame, Ranges};
 use demc_model::config::COLOR_CHANNELS;
 
-use crate::Bundle;
 use crate::ensemble::Ensemble;
-use crate::memory;
 use crate::padding::Padding;
 use crate::tiles::{Tiles, Tiling};
+use crate::{Bundle, memory};
 use input::{FrameInput, PixelRange};
 use layers::{check_layer_sizes, layer_images};
 
 pub use crate::error::{DenoiseError, LayersError};
-pub use demc_data::transform::MAX_INPUT_SCALE;
+pub use demc_data::input::transform::MAX_INPUT_SCALE;
 pub use layers::Layer;
 pub use seams::SeamError;
 
@@ -95,7 +94,7 @@ pub struct Denoised {
 }
 
 impl Bundle {
-    /// Denoises `frame`, of any size that a file can have ([`demc_data::exr::check_size`]).
+    /// Denoises `frame`, of any size that a file can have ([`demc_data::image::exr::check_size`]).
     ///
     /// The image is processed whole if memory allows, otherwise in tiles with the same result
     /// ([`crate::tiles`]). It is padded by edge replication to multiples of 32 and cropped
@@ -143,7 +142,7 @@ impl Bundle {
         }
         let scale = || match input_scale {
             Some(scale) => *scale,
-            None => self.input_scale(demc_data::ranges::exposure(&frame.color)),
+            None => self.input_scale(demc_data::input::ranges::exposure(&frame.color)),
         };
         let input = || FrameInput::new(self, frame);
         let statistics = || self.check_statistics(frame);
@@ -192,7 +191,7 @@ impl Bundle {
         })
     }
 
-    /// The factor on the colour of an image with this [`exposure`](demc_data::ranges::exposure).
+    /// The factor on the colour of an image with this [`exposure`](demc_data::input::ranges::exposure).
     ///
     /// It brings the image to the exposure level of training. It is 1 for a black image.
     ///

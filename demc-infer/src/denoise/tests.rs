@@ -65,7 +65,7 @@ fn demodulation_equals_a_division_by_hand() {
     let mut demodulating = bundle(Variant::Demc);
     demodulating.meta.normalizer.albedo_demodulation_epsilon = Some(0.07);
     let frame = frame(70, 100);
-    let (texture, pixels) = (demc_data::frame::TEXTURES, 70 * 100);
+    let (texture, pixels) = (demc_data::image::frame::TEXTURES, 70 * 100);
     let textures = &frame.features[texture * pixels..(texture + 3) * pixels];
     let divisors: Vec<f32> = textures.iter().map(|t| t.max(0.0) + 0.07).collect();
     let pairs = frame.color.iter().zip(&divisors);
@@ -344,7 +344,7 @@ fn a_black_image_stays_finite_and_has_scale_one() {
     let mut frame = frame(40, 40);
     let ranges = demc_data::Ranges::of(&[demc_data::FrameSummary::of(&frame)]);
     bundle.meta.ranges = Some(ranges);
-    let exposure = demc_data::ranges::exposure(&frame.color);
+    let exposure = demc_data::input::ranges::exposure(&frame.color);
     assert_eq!(bundle.input_scale(exposure), 1.0);
     assert_eq!(bundle.input_scale(1.9 * exposure), 1.0);
     assert_eq!(bundle.input_scale(0.0), 1.0);
@@ -381,7 +381,7 @@ fn albedo_above_one_counts_as_one() {
     let mut bundle = bundle(Variant::Demc);
     bundle.meta.normalizer.albedo_demodulation_epsilon = Some(0.07);
     let mut bright = frame(40, 40);
-    let first = demc_data::frame::TEXTURES * 40 * 40;
+    let first = demc_data::image::frame::TEXTURES * 40 * 40;
     bright.features[first] = 90.0;
     let mut white = bright.clone();
     white.features[first] = 1.0;

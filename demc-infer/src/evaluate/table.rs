@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-use demc_data::message::{list, printable};
 use demc_model::metrics::{METRICS, Metric};
+use demc_program::message::{list, printable};
 
 use super::{Report, Score, is_headline};
 

@@ -1,6 +1,6 @@
 //! Compares an image's statistics with the ranges of the training scenes.
 
-use demc_data::frame::FEATURE_NAMES;
+use demc_data::image::frame::FEATURE_NAMES;
 use demc_data::{FrameSummary, PositionSpace, Ranges};
 
 use super::Warning;

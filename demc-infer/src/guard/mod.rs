@@ -6,19 +6,20 @@
 //!   reference, because the noisy input is unbiased.
 //!
 //! A renderer that writes a wrong buffer causes no error: normals in camera space, normals packed
-//! into 0 to 1, swapped buffers. Known mistakes are tested first ([`demc_data::geometry`]).
+//! into 0 to 1, swapped buffers. Known mistakes are tested first ([`demc_data::check::geometry`]).
 //! The other channels are compared with the ranges of the training scenes (`drift`).
 
 mod drift;
 mod energy;
 
-use demc_data::frame::{FEATURE_NAMES, POSITIONS, TEXTURES};
-use demc_data::{Frame, FrameSummary, geometry};
+use demc_data::check::geometry;
+use demc_data::image::frame::{FEATURE_NAMES, POSITIONS, TEXTURES};
+use demc_data::{Frame, FrameSummary};
 
 use crate::Bundle;
 use crate::error::{DenoiseError, check_sizes};
 
-pub use demc_data::geometry::Warning;
+pub use demc_data::check::geometry::Warning;
 pub use energy::EnergyBias;
 
 /// Largest distance of a feature channel from the training mean, in training deviations: the root

@@ -29,7 +29,7 @@ use std::fs;
 use std::io::Write;
 use std::path::Path;
 
-use demc_data::frame::FEATURE_NAMES;
+use demc_data::image::frame::FEATURE_NAMES;
 use demc_model::config::{COLOR_CHANNELS, FEATURE_CHANNELS};
 
 use crate::bundle::Description;
@@ -89,7 +89,7 @@ impl Bundle {
         check_size(parameters.sum(), precision)?;
         let model = self.onnx(precision)?;
         let bytes = model.encode_to_vec();
-        demc_data::file::write_whole(path, |file| file.write_all(&bytes))?;
+        demc_program::file::write_whole(path, |file| file.write_all(&bytes))?;
         drop(bytes);
         let back = fs::read(path).map_err(|source| BundleError::Read {
             path: path.into(),

@@ -6,7 +6,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-use demc_data::frame::FEATURES;
+use demc_data::image::frame::FEATURES;
 use demc_data::{FeatureStats, Frame};
 use demc_model::Head;
 use rand::{Rng, RngExt, SeedableRng};

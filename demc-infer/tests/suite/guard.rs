@@ -101,7 +101,7 @@ fn check_prints_the_table_and_fails_on_a_warning() {
     // A range that no image is in.
     let mut strict = bundle;
     let ranges = strict.meta.ranges.as_mut().expect("they were set");
-    ranges.mean[6] = demc_data::ranges::Range {
+    ranges.mean[6] = demc_data::input::ranges::Range {
         low: 1e6,
         high: 1e6 + 1.0,
     };

@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use crate::arguments;
 use crate::common::demc_infer;
 use demc_data::Frame;
-use demc_data::exr::ExrFile;
-use demc_data::frame::decode_input;
-use demc_data::layout::detect;
-use demc_data::plane::Plane;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::frame::decode_input;
+use demc_data::image::layout::detect;
+use demc_data::image::plane::Plane;
 use demc_infer::{Bundle, device};
 use demc_model::metrics::rel_mse_image;
 

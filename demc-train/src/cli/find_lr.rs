@@ -9,8 +9,9 @@ use crate::run::data::{RunData, protect_inputs};
 use crate::tools::chart::with_extension;
 use crate::tools::find_lr::{RateRange, sweep};
 use clap::Args;
-use demc_data::message::{UsageError, printable};
-use demc_data::output::{Directories, Outputs};
+use demc_program::exit::UsageError;
+use demc_program::message::printable;
+use demc_program::output::{Directories, Outputs};
 
 use super::compute::ComputeArguments;
 

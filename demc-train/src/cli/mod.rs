@@ -11,8 +11,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 
 use crate::ranks::{self, Launch, Ranks, SharedError};
 use clap::{CommandFactory, Parser, Subcommand};
-use demc_data::{message, parallel};
 use demc_infer::compute::on_threads;
+use demc_program::{message, parallel};
 
 /// The exit code of a program that panicked.
 const PANICKED: u8 = 101;
@@ -62,9 +62,9 @@ pub fn command() -> clap::Command {
 
 /// Runs the program with its name and arguments. Returns the exit code.
 pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
-    let arguments = match Arguments::try_parse_from(arguments) {
+    let arguments = match demc_program::cli::parse::<Arguments>(arguments) {
         Ok(arguments) => arguments,
-        Err(shown) => return message::usage(&shown),
+        Err(code) => return code,
     };
     let launch = match Launch::start() {
         Ok(launch) => launch,

@@ -6,9 +6,9 @@ use crate::record::progress::say;
 use crate::tools::chart::with_extension;
 use crate::tools::plot::{PlotOptions, plot};
 use clap::Args;
-use demc_data::message::printable;
-use demc_data::output::{Directories, Outputs};
 use demc_infer::bundle::locate;
+use demc_program::message::printable;
+use demc_program::output::{Directories, Outputs};
 
 /// Draw loss and validation curves of one or more runs as SVG
 ///

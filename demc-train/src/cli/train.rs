@@ -9,7 +9,7 @@ use crate::record::progress::say;
 use crate::run::run_dir::{CONFIG, copy_in_checkpoint};
 use crate::run::session::{Session, SessionOptions, SessionOutcome};
 use clap::Args;
-use demc_data::message::printable;
+use demc_program::message::printable;
 
 use super::compute::{ComputeArguments, stopped};
 

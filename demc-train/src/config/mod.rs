@@ -18,10 +18,10 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use demc_data::DataConfig;
-use demc_data::file::{MAX_CONFIGURATION, read_text};
-use demc_data::message::printable;
 use demc_model::kernel_head::GAMMA;
 use demc_model::{Head, LossConfig, ModelConfig, Variant};
+use demc_program::file::{MAX_CONFIGURATION, read_text};
+use demc_program::message::printable;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 use toml::Value;

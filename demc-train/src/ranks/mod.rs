@@ -20,10 +20,10 @@ use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use demc_data::message::UsageError;
-use demc_data::output::OutputError;
 use demc_infer::compute::IsaError;
 use demc_infer::device::DeviceError;
+use demc_program::exit::UsageError;
+use demc_program::output::OutputError;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -266,7 +266,7 @@ impl Ranks {
         };
         let places = self.gather(Ok(Place {
             node: group.node(group.rank()),
-            threads: demc_data::parallel::threads().count,
+            threads: demc_program::parallel::threads().count,
             device: device.to_owned(),
         }))?;
         Ok(Some(Placement(&places, floats).to_string()))

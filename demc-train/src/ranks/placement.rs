@@ -37,7 +37,7 @@ impl fmt::Display for Placement<'_> {
             "{} ranks on {} node(s) ({}), threads per rank: {}, device: {}, each sends {:.1} MB per step",
             places.len(),
             nodes.len(),
-            demc_data::message::short_list(&nodes),
+            demc_program::message::short_list(&nodes),
             threads.join(" or "),
             devices.join(", "),
             bytes / 1e6

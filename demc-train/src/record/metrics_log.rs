@@ -5,9 +5,9 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use demc_data::file::write_whole;
-use demc_data::message::short_list;
 use demc_model::config::DETAIL_CHANNELS;
+use demc_program::file::write_whole;
+use demc_program::message::short_list;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 

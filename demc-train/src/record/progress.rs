@@ -3,7 +3,7 @@
 use std::fmt::Display;
 use std::time::Instant;
 
-use demc_data::message;
+use demc_program::message;
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// A progress bar over the steps of a run. It is hidden if stderr is not a terminal.

@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use demc_data::message::printable;
 use demc_infer::picture::Picture;
+use demc_program::message::printable;
 
 use crate::config::Config;
 use crate::record::metrics_log::{MetricsLine, MetricsLog, damaged_lines};

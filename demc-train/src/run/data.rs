@@ -5,12 +5,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context, ensure};
-use demc_data::checksum::sha256_of;
-use demc_data::content;
-use demc_data::exr::ExrFile;
-use demc_data::frame::{FramePlanes, Presence};
-use demc_data::message::short_list;
-use demc_data::output::Outputs;
+use demc_data::check::content;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::frame::{FramePlanes, Presence};
 use demc_data::{
     BatchLoader, ChannelLayout, DataConfig, Dataset, Dropout, Normalizer, PatchSource, Ranges,
     Scene, Split, Statistics,
@@ -18,6 +15,9 @@ use demc_data::{
 use demc_infer::Bundle;
 use demc_infer::bundle::{BundleMeta, locate};
 use demc_model::ModelConfig;
+use demc_program::checksum::sha256_of;
+use demc_program::message::short_list;
+use demc_program::output::Outputs;
 use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
@@ -90,7 +90,7 @@ pub fn protect_inputs(
     {
         outputs.protect(&file, "the initial weights");
     }
-    outputs.protect_dataset(&config.data.root)?;
+    demc_data::Dataset::protect(&config.data.root, outputs)?;
     Ok(())
 }
 
@@ -134,7 +134,7 @@ impl RunData {
             .collect();
         let all: Vec<Scene> = train.iter().chain(&validation).cloned().collect();
         // Validation scenes too: another seed may train on them.
-        demc_data::patch::patches(&all, *patch_size, *stride, *border)?;
+        demc_data::training::patch::patches(&all, *patch_size, *stride, *border)?;
         let statistics =
             Statistics::measure(&train, &layout, &config.data, config.loss.relmse_epsilon)
                 .context("measuring the training scenes")?;

@@ -4,10 +4,10 @@ use std::path::PathBuf;
 
 use anyhow::{Context, bail, ensure};
 use burn::tensor::Device;
-use demc_data::checksum::sha256_of;
-use demc_data::ranges::Ranges;
+use demc_data::input::ranges::Ranges;
 use demc_infer::bundle::{Bundle, BundleFile};
 use demc_model::{Denoiser, ModelConfig};
+use demc_program::checksum::sha256_of;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};

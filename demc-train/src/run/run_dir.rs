@@ -17,8 +17,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
 use demc_data::ChannelLayout;
-use demc_data::file::{remove_abandoned, write_whole};
 use demc_infer::bundle::locate::{BEST, LATEST};
+use demc_program::file::{remove_abandoned, write_whole};
 
 use crate::config::Config;
 use crate::record::metrics_log::MetricsLog;

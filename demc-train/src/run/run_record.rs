@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use anyhow::ensure;
-use demc_data::message::short_list;
 use demc_data::{ChannelLayout, Normalizer, Scene};
+use demc_program::message::short_list;
 use serde::{Deserialize, Serialize};
 
 use crate::run::data::RunData;

@@ -4,11 +4,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
 use burn::tensor::Device;
-use demc_data::checksum::sha256_of;
-use demc_data::message::UsageError;
-use demc_data::output::Outputs;
 use demc_infer::compute;
 use demc_infer::evaluate::Report;
+use demc_program::checksum::sha256_of;
+use demc_program::exit::UsageError;
+use demc_program::output::Outputs;
 
 use serde::{Deserialize, Serialize};
 

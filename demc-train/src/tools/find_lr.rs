@@ -11,7 +11,7 @@ use std::sync::Arc;
 use anyhow::Context;
 use burn::tensor::Device;
 use demc_data::Batch;
-use demc_data::file::write_whole;
+use demc_program::file::write_whole;
 
 use crate::config::Config;
 use crate::ranks::Ranks;

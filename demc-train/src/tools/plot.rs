@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 use serde::Deserialize;
 
-use demc_data::message::UsageError;
+use demc_program::exit::UsageError;
 
 use crate::record::metrics_log::{StoredLines, damaged_lines, read_lines};
 use crate::tools::chart::figure::{AxisScale, Figure, LinePanel, Series};

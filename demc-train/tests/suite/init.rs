@@ -11,6 +11,7 @@ use burn::tensor::Device;
 use demc_data::checksum::sha256_of;
 use demc_infer::Bundle;
 use demc_infer::bundle::{Names, Precision};
+use demc_program::checksum::sha256_of;
 
 /// The best weights of a run without running statistics, which change at any learning rate.
 fn weights(run: &Path) -> Vec<(String, Vec<f32>)> {

@@ -31,18 +31,19 @@ class Layout:
 
     name: str  # for messages
     channels: Mapping[str, tuple[str, ...]]  # of color, BUFFERS, reference, mask, alpha; without absent ones
+    alternatives: Mapping[str, tuple[tuple[str, ...], ...]]  # other names of BUFFERS, for files without these
     missing: Mapping[str, str]  # of each of BUFFERS: error, zeros, or copy-texture1
     layer: str | None = None  # the view layer in place of `*`
 
     @classmethod
     def from_table(cls, name: str, table: Mapping) -> Layout:
         """A layout from parsed TOML or JSON. Raises ValueError with all its mistakes."""
-        known = ("color", *BUFFERS, "reference", "mask", "alpha", "missing")
+        known = ("color", *BUFFERS, "reference", "mask", "alpha", "alternatives", "missing")
         problems = [f"unknown key {key}" for key in table if key not in known]
         channels, given = {}, table.get("missing", {})
         for buffer in ("color", *BUFFERS, "reference"):
             names = table.get(buffer)
-            if isinstance(names, list) and len(names) == 3 and all(isinstance(name, str) for name in names):
+            if is_triple(names):
                 channels[buffer] = tuple(names)
             elif names is not None or buffer == "color":
                 problems.append(f"{buffer}: expected three names of channels")
@@ -51,6 +52,19 @@ class Layout:
                 channels[key] = (name_of_one,)
             elif name_of_one is not None:
                 problems.append(f"{key}: expected the name of a channel")
+        alternatives, others = {}, table.get("alternatives", {})
+        if not isinstance(others, Mapping):
+            problems.append("alternatives: expected a table")
+            others = {}
+        for buffer, triples in others.items():
+            if buffer not in BUFFERS:
+                problems.append(f"unknown key alternatives.{buffer}")
+            elif not isinstance(triples, list) or not all(map(is_triple, triples)):
+                problems.append(f"alternatives.{buffer}: expected lists of three names of channels")
+            elif triples and buffer not in table:
+                problems.append(f"alternatives.{buffer} needs {buffer}, the names that come first")
+            else:
+                alternatives[buffer] = tuple(map(tuple, triples))
         if not isinstance(given, Mapping):
             problems.append("missing: expected a table")
             given = {}
@@ -64,12 +78,13 @@ class Layout:
                 problems.append(f'missing.{buffer}: expected "error", "zeros", or "copy-texture1"')
             elif policy == "error" and buffer not in table:
                 problems.append(f"{buffer} names no channels: name them or set missing.{buffer}")
-        names = [channel for buffer in channels.values() for channel in buffer]
+        triples = [*channels.values(), *(names for others in alternatives.values() for names in others)]
+        names = [channel for triple in triples for channel in triple]
         twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
         problems += [f"channel {json.dumps(name)} is named twice" for name in twice]
         if problems:
             raise ValueError(f"channel layout {name}: {'; '.join(problems)}")
-        return cls(name, channels, missing)
+        return cls(name, channels, alternatives, missing)
 
     def allowing(self, missing: Mapping[str, str]) -> Layout:
         """This layout with the policies of `missing` for buffers whose absence is an error."""
@@ -91,24 +106,34 @@ class Layout:
         """The names with the view layer in place of `*`."""
         named = lambda name: f"{layer}.{name.removeprefix(ANY_LAYER)}" if name.startswith(ANY_LAYER) else name
         channels = {buffer: tuple(map(named, names)) for buffer, names in self.channels.items()}
-        return replace(self, channels=channels, layer=layer)
+        others = {buffer: tuple(tuple(map(named, names)) for names in triples) for buffer, triples in self.alternatives.items()}
+        return replace(self, channels=channels, alternatives=others, layer=layer)
+
+    def named_as_in(self, found: Collection[str]) -> Layout:
+        """This layout with alternatives in place of names that are not among the channels `found`."""
+        is_in_file = lambda names: any(name in found for name in names)
+        channels = dict(self.channels)
+        for buffer, triples in self.alternatives.items():
+            if not is_in_file(channels[buffer]):
+                channels[buffer] = next(filter(is_in_file, triples), channels[buffer])
+        return replace(self, channels=channels, alternatives={})
 
     def in_file(self, path: Path, found: Collection[str], layer: str | None = None) -> Layout:
         """This layout with the names of one file. `layer` chooses among several view layers."""
         if not self.has_any_layer():
             if layer is not None:
                 raise problem(path, f"view layer {json.dumps(layer)}: the names of the layout have no `*` for it")
-            return self
+            return self.named_as_in(found)
         layers = self.layers(found)
         if layer in layers:
-            return self.with_layer(layer)
+            return self.with_layer(layer).named_as_in(found)
         if not layers:
             require(path, self.channels["color"], found)  # Raises: a name with `*` is in no file.
         if layer is not None:
             raise no_layer(path, layer, layers)
         if len(layers) > 1:
             raise problem(path, f"view layers {', '.join(layers)}: choose one")
-        return self.with_layer(layers[0])
+        return self.with_layer(layers[0]).named_as_in(found)
 
     def lacking(self, found: Collection[str]) -> list[str]:
         """The channels that a file with the channels `found` must have but lacks."""
@@ -134,6 +159,11 @@ class Layout:
                 by = "texture1 replaces it" if self.missing[buffer] == "copy-texture1" else "zeros replace it"
                 text += f"; no {buffer}: {by}"
         return text
+
+
+def is_triple(names: object) -> bool:
+    """Whether these are three names of channels."""
+    return isinstance(names, list) and len(names) == 3 and all(isinstance(name, str) for name in names)
 
 
 def resolve(name: str) -> Layout:
@@ -188,7 +218,7 @@ def detect(path: Path, found: Collection[str], missing: Mapping[str, str], layer
                 raise no_layer(path, layer, layers)
             layers = [layer]
         for candidate in [pattern.with_layer(name) for name in layers] or [pattern]:
-            candidate = candidate.allowing(missing)
+            candidate = candidate.named_as_in(found).allowing(missing)
             lacking = candidate.lacking(found)
             names = [name for buffer in ("color", *BUFFERS) for name in candidate.channels.get(buffer, ())]
             count = sum(name in found for name in names)

@@ -3,14 +3,14 @@
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
-use crate::Split;
-use crate::message::printable;
 use anyhow::Result;
+use demc_program::exit::UsageError;
+use demc_program::message::printable;
 use glob::Pattern;
 use regex_lite::Regex;
 
-use super::super::{IndexArguments, UsageError};
-use super::{Found, refuse};
+use super::found::{Found, refuse};
+use crate::dataset::Split;
 
 /// The rules for splits and base scenes.
 pub(super) struct Rules {
@@ -29,12 +29,13 @@ pub(super) struct Entry {
 }
 
 impl Rules {
-    pub(super) fn of(args: &IndexArguments) -> Result<Self, UsageError> {
+    /// The rules of `--test` and `--base`.
+    pub(super) fn new(test: &[String], base: Option<&str>) -> Result<Self, UsageError> {
         let pattern = |text: &String| match Pattern::new(text) {
             Ok(pattern) => Ok((text.clone(), pattern)),
             Err(error) => Err(UsageError(format!("--test {}: {error}", printable(text)))),
         };
-        let regex = |text: &String| {
+        let regex = |text: &str| {
             let shown = printable(text);
             let regex =
                 Regex::new(text).map_err(|error| UsageError(format!("--base {shown}: {error}")))?;
@@ -48,8 +49,8 @@ impl Rules {
             }
         };
         Ok(Self {
-            test: args.test.iter().map(pattern).collect::<Result<_, _>>()?,
-            base: args.base.as_ref().map(regex).transpose()?,
+            test: test.iter().map(pattern).collect::<Result<_, _>>()?,
+            base: base.map(regex).transpose()?,
         })
     }
 
@@ -78,9 +79,10 @@ impl Rules {
             let path = file
                 .rsplit_once('.')
                 .map_or(file.as_str(), |(path, _)| path);
-            let name = match unique {
-                true => stem(file).to_owned(),
-                false => path.replace('/', "-"),
+            let name = if unique {
+                stem(file).to_owned()
+            } else {
+                path.replace('/', "-")
             };
             if let Some(other) = names.insert(name.clone(), file) {
                 problems.push(format!("{other} and {file} both get the name {name}"));

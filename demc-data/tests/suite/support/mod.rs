@@ -8,7 +8,7 @@ pub mod rewritten;
 
 use std::path::{Path, PathBuf};
 
-use demc_data::transform::FeatureStats;
+use demc_data::input::transform::FeatureStats;
 use demc_data::{ChannelLayout, Normalizer, PositionSpace};
 use exr::prelude::*;
 

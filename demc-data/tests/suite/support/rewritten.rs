@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use demc_data::channel::Channel;
-use demc_data::exr::ExrFile;
-use demc_data::plane::Plane;
+use demc_data::image::channel::Channel;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::plane::Plane;
 use demc_data::{Compression, WriteOptions, Written, write_denoised};
 use exr::meta::MetaData;
 use exr::meta::attribute::{Chromaticities, IntegerBounds, TimeCode};

@@ -23,10 +23,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use burn::tensor::Device;
-use demc_data::file::write_whole;
 use demc_infer::bundle::locate::{AVERAGE, BEST, MODEL};
 use demc_infer::bundle::{Bundle, Names, Precision, tensors};
 use demc_model::Denoiser;
+use demc_program::file::write_whole;
 use serde::{Deserialize, Serialize};
 
 use crate::config::Config;

@@ -11,10 +11,10 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use demc_data::checksum::{sha256, sha256_of};
-use demc_data::file::{sync_dir, write_whole};
 use demc_infer::bundle::checksum::{SUMS, sums};
 use demc_infer::bundle::locate::{CHECKPOINTS, LATEST};
+use demc_program::checksum::{sha256, sha256_of};
+use demc_program::file::{sync_dir, write_whole};
 
 /// Suffix of an unfinished checkpoint.
 const UNFINISHED: &str = ".tmp";

@@ -13,8 +13,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use demc_data::message;
-use demc_data::output::{Directories, Outputs};
+use demc_program::message;
+use demc_program::output::{Directories, Outputs};
 
 use crate::config::Config;
 use crate::record::metrics_log;

@@ -13,8 +13,8 @@
 
 use std::path::{Path, PathBuf};
 
-use demc_data::file::{MAX_CONFIGURATION, read_text};
 use demc_model::ModelConfig;
+use demc_program::file::{MAX_CONFIGURATION, read_text};
 use serde::Deserialize;
 
 use crate::config::{Config, ConfigError, one_line};

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use demc_data::file::write_whole;
+use demc_program::file::write_whole;
 
 use super::comparison::{Comparison, VariantScores};
 use demc_infer::statistics::{Estimate, RESAMPLES};

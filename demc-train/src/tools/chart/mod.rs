@@ -16,7 +16,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, ensure};
-use demc_data::file::write_whole;
+use demc_program::file::write_whole;
 use plotters::prelude::*;
 
 use figure::Figure;

@@ -1,0 +1,342 @@
+//! Detects swapped, packed and rotated buffers from the properties of the buffers.
+//!
+//! - Normals are unit vectors and perpendicular to the surface that the positions describe.
+//! - Normals and positions are in the same space, world space.
+//! - Albedo is not negative.
+//!
+//! Each test takes a median or a share over a regular grid of pixels that hit a surface. All 108
+//! scenes of the data set pass; the scene closest to each limit is named beside it.
+
+use std::fmt;
+
+use crate::image::frame::{Frame, POSITIONS};
+
+/// Largest number of tested pixels.
+const MAX_SAMPLES: usize = 1 << 16;
+/// Smallest number of pixels for a meaningful test.
+const MIN_SAMPLES: usize = 64;
+/// Median length of the normals (all scenes: 1.00).
+const UNIT: std::ops::RangeInclusive<f32> = 0.9..=1.1;
+/// Share of pixels with a unit vector after unpacking that identifies packed normals. Of the
+/// scenes' own normals, packed, at least 0.755 are (classroom); of their albedo at most 0.589.
+const PACKED: f32 = 0.67;
+/// Smallest value of a packed normal or an albedo.
+const LOWEST: f32 = -0.05;
+/// Smallest median cosine between the normals and the surface that the positions describe
+/// (classroom: 0.977).
+const ALIGNED: f32 = 0.8;
+/// Share of normals that face the origin above which the origin must be the camera (staircase:
+/// 0.995).
+const FACING: f32 = 0.9995;
+
+/// First plane of each buffer.
+const NORMAL: usize = 0;
+const TEXTURE1: usize = 6;
+
+type Vector = [f32; 3];
+
+/// One sign that an image differs from the training data.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Warning {
+    /// The buffer or channel.
+    pub what: String,
+    /// The measured values.
+    pub found: String,
+    /// The likely cause.
+    pub cause: &'static str,
+}
+
+impl fmt::Display for Warning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { what, found, cause } = self;
+        write!(f, "{what}: {found}; {cause}")
+    }
+}
+
+/// Signs of swapped, packed and rotated buffers. The list is empty if fewer than 64 tested pixels hit
+/// a surface.
+///
+/// # Panics
+/// If a buffer of the frame does not have its size.
+pub fn warnings(frame: &Frame) -> Vec<Warning> {
+    let hits = SurfacePixels::of(frame);
+    if hits.pixels.len() < MIN_SAMPLES {
+        return Vec::new();
+    }
+    [hits.normals(), hits.texture()]
+        .into_iter()
+        .flatten()
+        .collect()
+}
+
+/// A frame, and the tested pixels: they and their four neighbours hit a surface.
+struct SurfacePixels<'a> {
+    frame: &'a Frame,
+    pixels: Vec<usize>,
+}
+
+impl<'a> SurfacePixels<'a> {
+    fn of(frame: &'a Frame) -> Self {
+        let Frame { width, height, .. } = *frame;
+        let hit = |i: usize| match &frame.mask {
+            Some(mask) => mask[i] >= 1.0,
+            None => vector(frame, POSITIONS, i) != [0.0; 3],
+        };
+        let inner = |length: usize| 1..length.saturating_sub(1);
+        let count = inner(width).len() * inner(height).len();
+        let pixels = inner(height)
+            .flat_map(|y| inner(width).map(move |x| y * width + x))
+            .step_by(count.div_ceil(MAX_SAMPLES).max(1))
+            .filter(|i| {
+                [*i, i - 1, i + 1, i - width, i + width]
+                    .into_iter()
+                    .all(hit)
+            })
+            .collect();
+        Self { frame, pixels }
+    }
+
+    fn normals(&self) -> Option<Warning> {
+        let length = self.median(|i| norm(vector(self.frame, NORMAL, i)));
+        let packed = |i| vector(self.frame, NORMAL, i).map(|x| 2.0 * x - 1.0);
+        let warning = |found, cause| {
+            Some(Warning {
+                what: "normal".into(),
+                found,
+                cause,
+            })
+        };
+        let unpacked = self.share(|i| UNIT.contains(&norm(packed(i))));
+        if unpacked >= PACKED && self.minimum(NORMAL) >= LOWEST {
+            let percent = 100.0 * unpacked;
+            return warning(
+                format!(
+                    "no value is negative, and 2 n - 1 is a unit vector at {percent:.0} % of the pixels"
+                ),
+                "is it packed into 0 to 1? Unpack it: n = 2 x - 1",
+            );
+        }
+        if !UNIT.contains(&length) {
+            return warning(
+                format!("its length is {length:.2} in the median, not 1"),
+                "is it another buffer (swapped with albedo?), or not normalised?",
+            );
+        }
+        let cosine = self.median(|i| self.cosine(i));
+        if cosine < ALIGNED {
+            return warning(
+                format!(
+                    "its median cosine with the surface that the positions describe is {cosine:.2}, not 1"
+                ),
+                "are normals in camera space and positions in world space, or axes swapped?",
+            );
+        }
+        let facing = self.share(|i| {
+            dot(
+                vector(self.frame, NORMAL, i),
+                vector(self.frame, POSITIONS, i),
+            ) < 0.0
+        });
+        if facing > FACING {
+            return warning(
+                "all normals face the origin".into(),
+                "are normals and positions in camera space? The network was trained on world space",
+            );
+        }
+        None
+    }
+
+    fn texture(&self) -> Option<Warning> {
+        let minimum = self.minimum(TEXTURE1);
+        (minimum < LOWEST).then(|| Warning {
+            what: "texture1".into(),
+            found: format!("its minimum is {minimum:.2}"),
+            cause: "albedo is not negative: is it swapped with the normal?",
+        })
+    }
+
+    /// Absolute cosine between the normal and the surface through the neighbours' positions.
+    fn cosine(&self, i: usize) -> f32 {
+        let position = |i| vector(self.frame, POSITIONS, i);
+        let across = difference(position(i + 1), position(i - 1));
+        let down = difference(
+            position(i + self.frame.width),
+            position(i - self.frame.width),
+        );
+        let surface = cross(across, down);
+        let normal = vector(self.frame, NORMAL, i);
+        // A constant position buffer describes no surface.
+        match norm(surface) * norm(normal) {
+            0.0 => 1.0,
+            lengths => (dot(surface, normal) / lengths).abs(),
+        }
+    }
+
+    fn median(&self, value: impl Fn(usize) -> f32) -> f32 {
+        let mut values: Vec<f32> = self.pixels.iter().map(|i| value(*i)).collect();
+        let middle = values.len() / 2;
+        *values.select_nth_unstable_by(middle, f32::total_cmp).1
+    }
+
+    fn share(&self, holds: impl Fn(usize) -> bool) -> f32 {
+        let count = self.pixels.iter().filter(|i| holds(**i)).count();
+        count as f32 / self.pixels.len() as f32
+    }
+
+    fn minimum(&self, first: usize) -> f32 {
+        let vectors = self.pixels.iter().map(|i| vector(self.frame, first, *i));
+        vectors.flatten().fold(f32::INFINITY, f32::min)
+    }
+}
+
+fn vector(frame: &Frame, first: usize, i: usize) -> Vector {
+    let pixels = frame.width * frame.height;
+    std::array::from_fn(|channel| frame.features[(first + channel) * pixels + i])
+}
+
+fn dot(a: Vector, b: Vector) -> f32 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+fn norm(a: Vector) -> f32 {
+    dot(a, a).sqrt()
+}
+
+fn difference(a: Vector, b: Vector) -> Vector {
+    std::array::from_fn(|i| a[i] - b[i])
+}
+
+fn cross(a: Vector, b: Vector) -> Vector {
+    std::array::from_fn(|i| {
+        let (j, k) = ((i + 1) % 3, (i + 2) % 3);
+        a[j] * b[k] - a[k] * b[j]
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::frame::FEATURES;
+
+    const SIDE: usize = 40;
+
+    /// A floor and a wall seen from `camera`, in world space, with grey albedo.
+    fn room(camera: Vector) -> Frame {
+        let pixels = SIDE * SIDE;
+        let mut features = vec![0.5; FEATURES * pixels];
+        for y in 0..SIDE {
+            for x in 0..SIDE {
+                let [u, v] = [x, y].map(|value| value as f32 / SIDE as f32 - 0.49);
+                // The ray hits the floor y = 0 or the wall z = 0, whichever is nearer.
+                let ray = [u, -v, -1.0];
+                let wall = camera[2];
+                let floor = if ray[1] < 0.0 {
+                    -camera[1] / ray[1]
+                } else {
+                    f32::INFINITY
+                };
+                let (distance, normal) = match floor < wall {
+                    true => (floor, [0.0, 1.0, 0.0]),
+                    false => (wall, [0.0, 0.0, 1.0]),
+                };
+                for channel in 0..3 {
+                    let i = y * SIDE + x;
+                    features[(NORMAL + channel) * pixels + i] = normal[channel];
+                    features[(POSITIONS + channel) * pixels + i] =
+                        camera[channel] + distance * ray[channel];
+                }
+            }
+        }
+        Frame {
+            name: "room".into(),
+            width: SIDE,
+            height: SIDE,
+            color: vec![0.5; 3 * pixels],
+            features,
+            reference: None,
+            mask: Some(vec![1.0; pixels]),
+            alpha: None,
+            clamped: 0,
+        }
+    }
+
+    fn mapped(mut frame: Frame, first: usize, map: impl Fn(Vector) -> Vector) -> Frame {
+        let pixels = SIDE * SIDE;
+        for i in 0..pixels {
+            let mapped = map(vector(&frame, first, i));
+            for (channel, value) in mapped.into_iter().enumerate() {
+                frame.features[(first + channel) * pixels + i] = value;
+            }
+        }
+        frame
+    }
+
+    fn found(frame: &Frame) -> Vec<String> {
+        let found = warnings(frame).into_iter();
+        found.map(|warning| warning.to_string()).collect()
+    }
+
+    const CAMERA: Vector = [1.0, 1.5, 4.0];
+
+    #[test]
+    fn a_room_in_world_space_causes_no_warning() {
+        assert_eq!(found(&room(CAMERA)), [""; 0]);
+    }
+
+    #[test]
+    fn each_mistake_has_its_own_words() {
+        let one = |frame: &Frame| match &found(frame)[..] {
+            [warning] => warning.clone(),
+            others => panic!("one warning, not {others:?}"),
+        };
+        let packed = mapped(room(CAMERA), NORMAL, |n| n.map(|x| x / 2.0 + 0.5));
+        assert!(one(&packed).contains("packed into 0 to 1"));
+        let long = mapped(room(CAMERA), NORMAL, |n| n.map(|x| 2.0 * x));
+        assert!(one(&long).starts_with("normal: its length is 2.00"));
+        let turned = mapped(room(CAMERA), NORMAL, |[x, y, z]| [x, z, -y]);
+        assert!(one(&turned).contains("normals in camera space and positions in world space"));
+        let camera = mapped(room(CAMERA), POSITIONS, |p| difference(p, CAMERA));
+        assert!(one(&camera).contains("normals and positions in camera space"));
+        let shifted = mapped(room(CAMERA), TEXTURE1, |t| t.map(|x| x - 1.0));
+        assert!(one(&shifted).starts_with("texture1: its minimum is -0.50"));
+    }
+
+    #[test]
+    fn both_swapped_buffers_are_named() {
+        let mut frame = mapped(room(CAMERA), NORMAL, |[x, y, z]| [x, -y, z]);
+        let pixels = SIDE * SIDE;
+        for i in 0..3 * pixels {
+            frame
+                .features
+                .swap(NORMAL * pixels + i, TEXTURE1 * pixels + i);
+        }
+        let found = found(&frame);
+        assert!(
+            found[0].starts_with("normal: its length is 0.87"),
+            "{found:?}"
+        );
+        assert!(
+            found[1].starts_with("texture1: its minimum is -1.00"),
+            "{found:?}"
+        );
+    }
+
+    #[test]
+    fn an_empty_or_tiny_image_causes_no_warning() {
+        let mut frame = mapped(room(CAMERA), NORMAL, |n| n.map(|x| 2.0 * x));
+        frame.mask = Some(vec![0.0; SIDE * SIDE]);
+        assert_eq!(found(&frame), [""; 0]);
+        for (width, height) in [(1, 1), (2, 40)] {
+            let pixels = width * height;
+            let tiny = Frame {
+                width,
+                height,
+                color: vec![0.5; 3 * pixels],
+                features: vec![2.0; FEATURES * pixels],
+                mask: None,
+                ..room(CAMERA)
+            };
+            assert_eq!(found(&tiny), [""; 0]);
+        }
+    }
+}

@@ -1,0 +1,158 @@
+//! `demc-data index`.
+
+mod found;
+mod rules;
+
+use std::collections::{BTreeSet, HashMap};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use demc_program::message::{self, printable};
+use demc_program::output::{Directories, Outputs};
+use demc_program::{exit, file};
+use serde_json::{Map, Value, json};
+
+use crate::dataset::{FORMAT, MAX_MANIFEST, Split};
+use found::{exr_files, headers};
+use rules::{Entry, Rules};
+
+#[derive(Args)]
+#[command(
+    after_help = "Examples:\n  demc-data index renders --test 'kitchen*'\n  demc-data index renders --test 'bath/*' --base '^([^/]+)/'"
+)]
+pub struct Arguments {
+    /// Directory of the scenes
+    #[arg(value_name = "DIR")]
+    root: PathBuf,
+    /// Glob pattern of the test scenes: relative paths or file names (repeatable)
+    #[arg(long, value_name = "PATTERN")]
+    test: Vec<String>,
+    /// Regular expression whose only group is the base scene, searched in the relative path without
+    /// extension; by default the file name without the number at its end
+    #[arg(long, value_name = "REGEX")]
+    base: Option<String>,
+    /// Channel layout: a preset or a TOML file; by default the preset that fits each file
+    #[arg(long, value_name = "PRESET|FILE")]
+    layout: Option<String>,
+    /// Replace an existing manifest; keys of its scenes that this command does not set stay
+    #[arg(long)]
+    overwrite: bool,
+}
+
+impl Arguments {
+    /// Writes the manifest and prints one line.
+    pub fn run(&self) -> Result<u8> {
+        let rules = Rules::new(&self.test, self.base.as_deref())?;
+        let manifest = self.root.join("manifest.json");
+        let exists = manifest.symlink_metadata().is_ok();
+        let (files, ignored) = exr_files(&self.root)?;
+        let mut outputs = Outputs::default();
+        for file in &files {
+            outputs.protect(&self.root.join(file), &format!("scene {}", file.display()));
+        }
+        if let Some(layout) = &self.layout {
+            outputs.protect(Path::new(layout), "the channel layout");
+        }
+        outputs.claim(&manifest, self.overwrite)?;
+        outputs.prepare(Directories::Expect)?;
+        let mut before = if exists {
+            Before::read(&manifest)?
+        } else {
+            Before::default()
+        };
+        if files.is_empty() {
+            bail!("{}: no EXR files in it or below", self.root.display());
+        }
+        let found = headers(&self.root, &files, self.layout.as_deref())?;
+        let scenes = rules.scenes(&self.root, &found)?;
+        let count = |split: Split| scenes.iter().filter(|scene| scene.split == split).count();
+        let bases: BTreeSet<&str> = scenes.iter().map(|scene| scene.base.as_str()).collect();
+        let mut summary = format!(
+            "{}: {} scenes ({} train, {} test) of {} base scenes, layout {}",
+            manifest.display(),
+            scenes.len(),
+            count(Split::Train),
+            count(Split::Test),
+            bases.len(),
+            found[0].layout,
+        );
+        if ignored > 0 {
+            summary += &format!("; other files and links, ignored: {ignored}");
+        }
+        let entries: Vec<Value> = scenes.iter().map(|scene| before.entry(scene)).collect();
+        let gone = before.scenes.len();
+        if gone > 0 {
+            summary += &format!("; scenes of the old manifest without a file, dropped: {gone}");
+        }
+        let mut keys = before.keys;
+        keys.insert("scenes".to_owned(), Value::Array(entries));
+        let text = serde_json::to_string_pretty(&keys)? + "\n";
+        file::write_whole(&manifest, |writer| writer.write_all(text.as_bytes()))?;
+        message::status(printable(&summary));
+        Ok(exit::SUCCESS)
+    }
+}
+
+/// The manifest that is replaced.
+struct Before {
+    /// Its keys, with an empty list of scenes.
+    keys: Map<String, Value>,
+    /// Its entries by file.
+    scenes: HashMap<String, Map<String, Value>>,
+}
+
+impl Default for Before {
+    fn default() -> Self {
+        let mut keys = Map::new();
+        keys.insert("format".to_owned(), FORMAT.into());
+        Self {
+            keys,
+            scenes: HashMap::new(),
+        }
+    }
+}
+
+impl Before {
+    fn read(path: &Path) -> Result<Self> {
+        let shown = path.display();
+        let text =
+            file::read_text(path, MAX_MANIFEST).with_context(|| format!("cannot read {shown}"))?;
+        let mut before = Self::default();
+        let keys: Map<String, Value> =
+            serde_json::from_str(&text).with_context(|| format!("{shown} is not a manifest"))?;
+        before.keys.extend(keys);
+        before.keys.insert("format".to_owned(), FORMAT.into());
+        let scenes = before.keys.insert("scenes".to_owned(), Value::Null);
+        let Some(Value::Array(scenes)) = scenes else {
+            bail!("{shown} is not a manifest: it has no list `scenes`");
+        };
+        for scene in scenes {
+            if let Value::Object(scene) = scene
+                && let Some(Value::String(file)) = scene.get("file")
+            {
+                before.scenes.insert(file.clone(), scene);
+            }
+        }
+        Ok(before)
+    }
+
+    /// The new entry of a scene, with the other keys of its old one.
+    fn entry(&mut self, scene: &Entry) -> Value {
+        let mut entry = json!({
+            "name": scene.name,
+            "split": scene.split,
+            "base": scene.base,
+            "file": scene.file,
+            "width": scene.width,
+            "height": scene.height,
+        });
+        if let (Some(entry), Some(old)) = (entry.as_object_mut(), self.scenes.remove(&scene.file)) {
+            for (key, value) in old {
+                entry.entry(key).or_insert(value);
+            }
+        }
+        entry
+    }
+}

@@ -1,0 +1,281 @@
+//! The plan of a rewritten file: its headers, and the source of each part's channels.
+
+use std::fmt;
+use std::io::{Read, Seek};
+
+use ::exr::meta::attribute::{ChannelList, LevelMode, SampleType};
+use ::exr::meta::header::Header;
+use ::exr::meta::{BlockDescription, Headers};
+
+use super::compression::{Compression, name_of};
+use super::failure::undecodable;
+use super::read::{ExrFile, printable};
+use super::write::SamplePrecision;
+use crate::error::Error;
+use crate::image::channel::Channel;
+
+/// Options for writing a denoised image.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct WriteOptions {
+    /// Channels of the input to keep.
+    pub channels: OutputChannels,
+    /// Type of the channels of colour and layers; `None`: as in the input (`float` instead of `uint`).
+    pub precision: Option<SamplePrecision>,
+    /// Compression of the parts with colour; `None`: as in the input. If that would change other
+    /// channels or cannot be written, [`Compression::Zip`].
+    pub compression: Option<Compression>,
+}
+
+/// Channels of the input to keep in the output.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum OutputChannels {
+    /// All channels.
+    #[default]
+    All,
+    /// Only colour, layers, and the alpha channel of the same part (`A` beside `R`, `beauty.A` beside
+    /// `beauty.R`).
+    Color,
+}
+
+/// A difference between the layouts of input and output.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Change {
+    /// The input's compression would have changed other channels or cannot be written.
+    Compression {
+        /// The part's name; empty if it has none.
+        part: String,
+        /// The compression of the input.
+        from: &'static str,
+        /// The compression of the output.
+        to: Compression,
+    },
+    /// The requested compression changes the other channels.
+    Lossy {
+        /// The part's name; empty if it has none.
+        part: String,
+        /// The requested compression.
+        to: Compression,
+    },
+    /// Smaller copies of the image (mip or rip levels) were dropped, because they show the noise.
+    Levels {
+        /// The part's name; empty if it has none.
+        part: String,
+    },
+}
+
+impl fmt::Display for Change {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (Change::Compression { part, .. }
+        | Change::Lossy { part, .. }
+        | Change::Levels { part }) = self;
+        if !part.is_empty() {
+            write!(f, "part {part}: ")?;
+        }
+        match self {
+            Change::Compression { from, to, .. } => {
+                write!(
+                    f,
+                    "compressed with {to} instead of {from}, so that the other channels stay unchanged"
+                )
+            }
+            Change::Lossy { to, .. } => {
+                write!(
+                    f,
+                    "compressed with {to}, which also changes the other channels"
+                )
+            }
+            Change::Levels { .. } => f.write_str("written without its smaller levels"),
+        }
+    }
+}
+
+pub(in crate::image) struct RewritePlan {
+    pub(super) headers: Headers,
+    pub(super) parts: Vec<PlannedPart>,
+    pub(in crate::image) changes: Vec<Change>,
+}
+
+/// The names of the channels that get other values.
+#[derive(Debug, Clone, Copy)]
+pub(in crate::image) struct ReplacedNames<'a> {
+    /// Red, green, and blue.
+    pub(in crate::image) color: &'a [String; 3],
+    /// Alpha of the colour, which is replaced if there are samples for it.
+    pub(in crate::image) alpha: Option<&'a str>,
+    /// Further channels.
+    pub(in crate::image) layers: &'a [String],
+}
+
+pub(super) struct PlannedPart {
+    pub(super) input: usize,
+    /// Its channels, in the order of the header; `None` if the blocks of the input are copied.
+    pub(super) channels: Option<Vec<ChannelOrigin>>,
+}
+
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ChannelOrigin {
+    pub(super) index: usize,
+    /// The plane of denoised values that replaces it.
+    pub(super) plane: Option<usize>,
+}
+
+impl RewritePlan {
+    pub(in crate::image) fn new<R: Read + Seek>(
+        file: &ExrFile<R>,
+        names: &ReplacedNames<'_>,
+        samples: usize,
+        options: &WriteOptions,
+    ) -> Result<Self, Error> {
+        let replaced = replaced_channels(file, names, samples)?;
+        let color = &replaced[..3];
+        let mut plan = Self {
+            headers: Headers::new(),
+            parts: Vec::new(),
+            changes: Vec::new(),
+        };
+        for (input, header) in file.source.meta.headers.iter().enumerate() {
+            let channels = file.channels().iter().filter(|c| c.part == input);
+            let origins: Vec<ChannelOrigin> = channels
+                .filter_map(|channel| origin(channel, &replaced, color, options.channels))
+                .collect();
+            if origins.is_empty() {
+                continue;
+            }
+            let colored = origins.iter().any(|origin| origin.plane.is_some());
+            plan.headers.push(if colored {
+                colored_header(header, &origins, options, &mut plan.changes)
+            } else {
+                header.clone()
+            });
+            let channels = colored.then_some(origins);
+            plan.parts.push(PlannedPart { input, channels });
+        }
+        Ok(plan)
+    }
+}
+
+/// The channels with other values, in the order of their planes: colour, alpha if there is a plane
+/// for it, and the layers.
+fn replaced_channels<'a, R: Read + Seek>(
+    file: &'a ExrFile<R>,
+    names: &ReplacedNames<'_>,
+    samples: usize,
+) -> Result<Vec<&'a Channel>, Error> {
+    let ReplacedNames {
+        color,
+        alpha,
+        layers,
+    } = *names;
+    let required: Vec<&str> = color.iter().chain(layers).map(String::as_str).collect();
+    file.require(&required)?;
+    let find = |name: &String| file.channel(name);
+    let mut channels: Vec<&Channel> = color.iter().filter_map(find).collect();
+    let (first, window) = (channels[0], channels[0].window);
+    if samples == (4 + layers.len()) * window.width * window.height {
+        channels.extend(alpha.and_then(|name| file.channel(name)));
+    }
+    channels.extend(layers.iter().filter_map(find));
+    if let Some(other) = channels.iter().find(|channel| channel.window != window) {
+        return Err(Error::Sizes {
+            path: file.path().to_owned(),
+            a: first.name.clone(),
+            a_window: window.to_string(),
+            b: other.name.clone(),
+            b_window: other.window.to_string(),
+        });
+    }
+    if channels.len() * window.width * window.height != samples {
+        let detail = format!("{samples} samples of colour do not match {window}, its current size");
+        return Err(undecodable(file.path(), detail));
+    }
+    Ok(channels)
+}
+
+/// The source of an output channel; `None` if the channel is dropped.
+fn origin(
+    channel: &Channel,
+    replaced: &[&Channel],
+    color: &[&Channel],
+    keep: OutputChannels,
+) -> Option<ChannelOrigin> {
+    let index = channel.index;
+    let plane = replaced
+        .iter()
+        .position(|c| (c.part, c.index) == (channel.part, index));
+    let stays = plane.is_some() || keep == OutputChannels::All || is_alpha(channel, color);
+    stays.then_some(ChannelOrigin { index, plane })
+}
+
+/// Whether this is an alpha channel of the colour: `A` beside `R`, or `beauty.A` beside `beauty.R`,
+/// in one part.
+fn is_alpha(channel: &Channel, color: &[&Channel]) -> bool {
+    let split = |name: &str| {
+        let start = name.rfind('.').map_or(0, |dot| dot + 1);
+        (name[..start].to_owned(), name[start..].to_owned())
+    };
+    let (prefix, suffix) = split(&channel.name);
+    let beside = |c: &&Channel| c.part == channel.part && split(&c.name).0 == prefix;
+    suffix.eq_ignore_ascii_case("a") && color.iter().any(beside)
+}
+
+/// The header of a part with colour.
+fn colored_header(
+    input: &Header,
+    origins: &[ChannelOrigin],
+    options: &WriteOptions,
+    changes: &mut Vec<Change>,
+) -> Header {
+    let name = input.own_attributes.layer_name.as_ref();
+    let part = name.map_or(String::new(), printable);
+    let channels = origins.iter().map(|origin| {
+        let mut channel = input.channels.list[origin.index].clone();
+        if origin.plane.is_some() {
+            channel.sample_type = match options.precision {
+                Some(SamplePrecision::Half) => SampleType::F16,
+                None if channel.sample_type == SampleType::F16 => SampleType::F16,
+                _ => SampleType::F32,
+            };
+        }
+        channel
+    });
+    let channels = ChannelList::new(channels.collect());
+
+    let lossless = |compression: Compression| {
+        let others = origins.iter().filter(|origin| origin.plane.is_none());
+        let mut kinds = others.map(|origin| input.channels.list[origin.index].sample_type);
+        kinds.all(|kind| compression.method().is_lossless_for(kind))
+    };
+    let compression = match (options.compression, Compression::of(input.compression)) {
+        (Some(chosen), _) => {
+            if !lossless(chosen) {
+                changes.push(Change::Lossy {
+                    part: part.clone(),
+                    to: chosen,
+                });
+            }
+            chosen.method()
+        }
+        (None, Some(own)) if lossless(own) => input.compression,
+        (None, _) => {
+            changes.push(Change::Compression {
+                part: part.clone(),
+                from: name_of(input.compression),
+                to: Compression::Zip,
+            });
+            Compression::Zip.method()
+        }
+    };
+
+    let mut blocks = input.blocks;
+    if let BlockDescription::Tiles(tiles) = &mut blocks
+        && tiles.level_mode != LevelMode::Singular
+    {
+        tiles.level_mode = LevelMode::Singular;
+        changes.push(Change::Levels { part });
+    }
+    let header = Header {
+        channels,
+        ..input.clone()
+    };
+    header.with_encoding(compression, blocks, input.line_order)
+}

@@ -1,0 +1,99 @@
+//! Writes a denoised image as a copy of its input with a different colour.
+//!
+//! Parts and their names, windows, header attributes, tiles, line order and all other channels stay
+//! as in the input. Other channels keep their bits. [`Written::changes`] lists each unavoidable
+//! difference.
+//!
+//! Parts without colour are copied in compressed form, including smaller levels. A part with colour
+//! is decoded and compressed in small batches of blocks. Besides the colour, this needs memory for
+//! a few blocks per processor, for any image size.
+
+use std::io::{Read, Seek};
+use std::path::Path;
+
+use super::exr::ExrFile;
+use super::exr::plan::{ReplacedNames, RewritePlan};
+use super::exr::recode::recode;
+use crate::error::Error;
+use crate::image::layout::ChannelLayout;
+
+pub use super::exr::plan::{Change, OutputChannels, WriteOptions};
+
+/// The result of writing an image.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Written {
+    /// Samples of colour and layers beyond the range of half, written as its largest value, 65504.
+    pub clamped: usize,
+    /// Differences between the layouts of output and input.
+    pub changes: Vec<Change>,
+}
+
+/// As [`rewrite`], for the file at `input`.
+///
+/// # Errors
+/// As [`crate::image::frame::read_frame`] and [`rewrite`].
+pub fn write_denoised(
+    input: &Path,
+    layout: &ChannelLayout,
+    color_hdr: &[f32],
+    output: &Path,
+    options: &WriteOptions,
+) -> Result<Written, Error> {
+    rewrite(
+        &mut ExrFile::open(input)?,
+        layout,
+        color_hdr,
+        output,
+        options,
+    )
+}
+
+/// Copies a file with the denoised colour, and alpha if given, in place of the layout's channels. The output is
+/// complete or absent.
+///
+/// # Shapes
+/// `color_hdr` is `[3, height, width]` of the colour's window, linear radiance, or
+/// `[4, height, width]` with the layout's alpha.
+///
+/// # Errors
+/// [`Error::Read`], [`Error::Exr`] and [`Error::MissingChannels`] for the input, as
+/// [`ExrFile::read`]. [`Error::Sizes`] if its colour channels cover different pixels.
+/// [`Error::Exr`] if their number differs from `color_hdr`. [`Error::Write`] for the output.
+pub fn rewrite<R: Read + Seek>(
+    file: &mut ExrFile<R>,
+    layout: &ChannelLayout,
+    color_hdr: &[f32],
+    output: &Path,
+    options: &WriteOptions,
+) -> Result<Written, Error> {
+    rewrite_with_layers(file, layout, &[], color_hdr, output, options)
+}
+
+/// As [`rewrite`], with further channels, `layers`, that have other values.
+///
+/// # Shapes
+/// `planes` are the colour, and alpha if given, as for `rewrite`, then a plane for each layer.
+///
+/// # Errors
+/// As [`rewrite`]; for layers as for the colour's channels.
+pub fn rewrite_with_layers<R: Read + Seek>(
+    file: &mut ExrFile<R>,
+    layout: &ChannelLayout,
+    layers: &[String],
+    planes: &[f32],
+    output: &Path,
+    options: &WriteOptions,
+) -> Result<Written, Error> {
+    let layout = layout.in_file(file, None)?;
+    let names = ReplacedNames {
+        color: &layout.color,
+        alpha: layout.alpha.as_deref(),
+        layers,
+    };
+    let plan = RewritePlan::new(file, &names, planes.len(), options)?;
+    let clamped = recode(file, &plan, planes, output)?;
+    Ok(Written {
+        clamped,
+        changes: plan.changes,
+    })
+}
