@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use crate::support::batches::{small, source, train_scenes};
 use crate::support::{identity, layout, scene_channels, write};
-use demc_data::cache::{AlbedoFilter, SceneCache};
-use demc_data::frame::TEXTURES;
+use demc_data::image::frame::TEXTURES;
+use demc_data::training::cache::{AlbedoFilter, SceneCache};
 use demc_data::{
     Augment, Batch, BatchLoader, Border, DataConfig, Error, FEATURES, Frame, Normalizer,
     PatchSource, Scene, Statistics, read_frame,

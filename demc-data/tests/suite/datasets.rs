@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use crate::support::{half, layout, sample, scene_channels, write};
-use demc_data::transform::STD_FLOOR;
+use demc_data::input::transform::STD_FLOOR;
 use demc_data::{ChannelLayout, DataConfig, Dataset, Error, Scene, Split, Statistics, read_frame};
 use serde_json::{Value, json};
 

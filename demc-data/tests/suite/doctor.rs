@@ -5,8 +5,8 @@ use std::fs;
 use std::path::Path;
 
 use crate::support::{sample, write};
-use demc_data::doctor::{Report, examine};
-use demc_data::exr::ExrFile;
+use demc_data::check::doctor::{Report, examine};
+use demc_data::image::exr::ExrFile;
 use exr::prelude::FlatSamples;
 use serde_json::{Value, json};
 

@@ -8,8 +8,8 @@ use std::process::{Command, Output};
 
 use crate::support::files::{header, placed, rgb_kinds, sample, scene_kinds, tiled, write_file};
 use crate::support::layout;
-use demc_data::channel::Window;
-use demc_data::exr::ExrFile;
+use demc_data::image::channel::Window;
+use demc_data::image::exr::ExrFile;
 use demc_data::{ChannelLayout, read_frame};
 use exr::math::RoundingMode;
 use exr::meta::attribute::{IntegerBounds, LevelMode};

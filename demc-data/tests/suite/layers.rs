@@ -5,10 +5,10 @@ use std::path::Path;
 use crate::support::files::{header, rgb_kinds, scene_kinds, write_file};
 use crate::support::rewritten::{PIXELS, SIZE, color, planes};
 use crate::support::{half, layout, named, write};
-use demc_data::exr::ExrFile;
-use demc_data::exr::rewrite::rewrite_with_layers;
-use demc_data::frame::layers::{check_layers, decode_layers};
-use demc_data::plane::Plane;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::frame::layers::{check_layers, decode_layers};
+use demc_data::image::plane::Plane;
+use demc_data::image::rewrite::rewrite_with_layers;
 use demc_data::{Error, OutputChannels, SamplePrecision, WriteOptions};
 use exr::prelude::{Compression as Method, FlatSamples, SampleType};
 

@@ -1,9 +1,9 @@
 //! Reads EXR files of every supported kind.
 
 use crate::support::{ZIP, half, layout, named, part, sample, scene_channels, write, write_parts};
-use demc_data::exr::ExrFile;
-use demc_data::layout::Missing;
-use demc_data::plane::Plane;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::layout::Missing;
+use demc_data::image::plane::Plane;
 use demc_data::{Error, FEATURES, read_frame};
 use exr::prelude::*;
 

@@ -4,8 +4,8 @@ use std::fs;
 use std::path::Path;
 
 use crate::support::{ZIP, half, layout, named, part, sample, scene_channels, write, write_parts};
-use demc_data::exr::{ExrFile, MAX_SIDE};
-use demc_data::frame::decode_repaired;
+use demc_data::image::exr::{ExrFile, MAX_SIDE};
+use demc_data::image::frame::decode_repaired;
 use demc_data::{ChannelLayout, read_frame};
 use exr::prelude::*;
 use rand::{RngExt, SeedableRng};

@@ -10,10 +10,9 @@ use crate::support::rewritten::{
     with_attributes,
 };
 use crate::support::{layout, sample};
-use demc_data::exr::ExrFile;
-use demc_data::{
-    Change, Compression, WriteOptions, Written, frame, rewrite as rewriting, write_denoised,
-};
+use demc_data::image::exr::ExrFile;
+use demc_data::image::{frame, rewrite as rewriting};
+use demc_data::{Change, Compression, WriteOptions, Written, write_denoised};
 use exr::math::RoundingMode;
 use exr::meta::BlockDescription;
 use exr::meta::attribute::LevelMode;

@@ -9,8 +9,8 @@ use crate::support::rewritten::{
     PIXELS, SIZE, assert_carried, changes, color, display, headers, method, planes, rewrite,
     with_attributes,
 };
-use demc_data::exr::ExrFile;
-use demc_data::plane::Plane;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::plane::Plane;
 use demc_data::{
     Change, ChannelLayout, Compression, Error, OutputChannels, SamplePrecision, WriteOptions,
     Written, write_denoised,

@@ -1,6 +1,6 @@
 //! Finished images from other programs.
 
-use demc_data::rgb::read_rgb;
+use demc_data::image::rgb::read_rgb;
 use demc_data::{Error, SamplePrecision, write_rgb};
 
 #[test]

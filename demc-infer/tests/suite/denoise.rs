@@ -5,8 +5,8 @@ use std::path::Path;
 
 use crate::arguments;
 use crate::common::{Outcome, demc_infer, random_bundle, run_directory, sample, sample_image};
-use demc_data::exr::ExrFile;
-use demc_data::plane::Plane;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::plane::Plane;
 use demc_data::read_frame;
 use demc_infer::Bundled;
 

@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 
 use crate::arguments;
 use crate::common::{Outcome, demc_infer, kernel_run_directory, run_directory};
-use demc_data::exr::ExrFile;
-use demc_data::exr::merge::{MergeInput, merge};
-use demc_data::plane::Plane;
+use demc_data::image::exr::ExrFile;
+use demc_data::image::exr::merge::{MergeInput, merge};
+use demc_data::image::plane::Plane;
 use demc_data::{SamplePrecision, write_rgb};
 
 /// Light groups as Cycles names them.

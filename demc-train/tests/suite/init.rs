@@ -8,7 +8,6 @@ use crate::common::{
     RESULTS, assert_same_run, config, error_line, kill_after, metrics, train, trained,
 };
 use burn::tensor::Device;
-use demc_data::checksum::sha256_of;
 use demc_infer::Bundle;
 use demc_infer::bundle::{Names, Precision};
 use demc_program::checksum::sha256_of;

@@ -6,7 +6,7 @@ use std::process::Stdio;
 use crate::common::{
     command, config, error_line, metrics, place, says, train, trained, wait_until,
 };
-use demc_data::file::temporary_name;
+use demc_program::file::temporary_name;
 
 /// The largest learning rate, without batch normalisation: the network's output soon overflows.
 const EXPLODE: [&str; 4] = [
