@@ -170,7 +170,7 @@ pub unsafe extern "C" fn demcGetDeviceError(
 ) -> DemcError {
     // SAFETY: the caller passes NULL or a handle with a reference.
     let device = unsafe { handle::shared("device", device) }.ok();
-    let (code, text) = fetch(device.as_deref());
+    let (code, text) = fetch(device.as_ref().map(|device| &device.errors));
     if !message.is_null() {
         // SAFETY: the caller passes NULL or a pointer to write to.
         unsafe { ptr::write(message, text) };

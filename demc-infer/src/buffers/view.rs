@@ -3,7 +3,7 @@
 use half::f16;
 use rayon::prelude::*;
 
-use super::{BufferError, Shape};
+use super::error::{BufferError, Shape};
 
 /// Type of samples, in the machine's byte order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

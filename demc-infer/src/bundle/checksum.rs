@@ -11,7 +11,7 @@ use demc_program::checksum::sha256;
 use demc_program::message::printable;
 use safetensors::SafeTensors;
 
-use super::BundleError;
+use super::error::BundleError;
 
 /// File of a checkpoint with the checksums of its other files, as `sha256sum` writes it.
 pub const SUMS: &str = "SHA256SUMS";

@@ -11,7 +11,7 @@ use demc_data::image::rewrite::{OutputChannels, WriteOptions, rewrite_with_layer
 use demc_program::message;
 use demc_program::output::{Directories, Outputs};
 
-use super::Clamped;
+use super::clamped::Clamped;
 use super::exposure::{InputScaleFlag, SequenceScales, stops};
 use super::flags::{DeviceFlag, EnsembleFlag, LightFlag, ModelFlag, TilingFlags, describe};
 use super::frames::Frames;

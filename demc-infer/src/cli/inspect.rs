@@ -11,7 +11,7 @@ use demc_program::message::{self, printable};
 use serde::Serialize;
 
 use super::flags::ModelFlag;
-use super::utf8_for_json;
+use super::outputs::utf8_for_json;
 use crate::{Bundle, BundleMeta, Names, Precision};
 
 /// Show a model: network, training step, statistics and input channels.

@@ -12,9 +12,11 @@ use demc_data::input::transform::MAX_ALBEDO;
 use demc_model::config::COLOR_CHANNELS;
 use rayon::prelude::*;
 
-use super::{DenoiseError, DenoiseObserver, DenoiseProgress, FrameInput, unobserved};
+use super::input::FrameInput;
+use super::progress::{DenoiseObserver, DenoiseProgress, unobserved};
 use crate::Bundle;
 use crate::ensemble::Ensemble;
+use crate::error::DenoiseError;
 use crate::padding::Padding;
 use crate::tiles::Tiling;
 

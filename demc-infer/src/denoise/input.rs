@@ -12,11 +12,11 @@ use demc_model::inference::Cancelled;
 use rayon::prelude::*;
 
 use super::layers::{Layer, LayerTile};
-use super::{DenoiseError, DenoiseObserver, DenoiseProgress};
+use super::progress::{DenoiseObserver, DenoiseProgress};
 use crate::Bundle;
 use crate::ensemble::Ensemble;
-use crate::error::check_sizes;
-use crate::padding::Padding;
+use crate::error::{DenoiseError, check_sizes};
+use crate::padding::{Padding, PixelRange};
 use crate::tiles::Tiles;
 
 /// The exposure that alpha is scaled to for the network. On one image of Cycles, 0.05 gave a third of
@@ -55,9 +55,6 @@ fn varies(plane: &[f32], height: usize, width: usize) -> Vec<bool> {
     };
     pixels.map(differs).collect()
 }
-
-/// Rows or columns of the padded image, in pixels.
-pub(super) type PixelRange = std::ops::Range<usize>;
 
 impl<'a> FrameInput<'a> {
     /// The input of one pass; fails for buffers of the wrong size.

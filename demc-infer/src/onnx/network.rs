@@ -17,9 +17,14 @@ use demc_model::layers::ConvBlock;
 use demc_model::{Denoiser, Role, WeightSpec};
 
 use super::graph::{AttributeValue, GraphBuilder, Value};
-use super::{COLOR, FEATURES, OUTPUT};
 use crate::Precision;
 
+/// Name of the input with the noisy colour.
+pub const COLOR: &str = "color";
+/// Name of the input with the features.
+pub const FEATURES: &str = "features";
+/// Name of the output.
+pub const OUTPUT: &str = "output";
 impl GraphBuilder {
     pub(super) fn denoise(&mut self, model: &Denoiser, normalizer: &Normalizer) {
         let features = self.albedo_clamped();

@@ -4,12 +4,14 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::TAPS;
 use crate::Isa;
 use crate::product::Panels;
 use crate::rows::Packed;
 use crate::scratch::Shared;
 use crate::simd::{Leaf, Simd, WIDEST, run};
+
+/// Offsets of the 2x2 inputs of a cell.
+pub(super) const TAPS: [(usize, usize); 4] = [(0, 0), (0, 1), (1, 0), (1, 1)];
 
 /// Packs a weight `[in, out, 4, 4]` by taps. Each task packs the rows of some inputs of `in x 4
 /// out` matrices, or (transposed) the rows of some outputs of `4 out x in` matrices.

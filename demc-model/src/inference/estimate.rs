@@ -2,9 +2,9 @@
 
 use demc_kernels::{Grid, memory};
 
-use super::BandPlan;
 use super::encoder::DEEPEST_BANDED;
 use super::full_resolution::UPPER_LEVELS;
+use super::pass::BandPlan;
 use crate::config::{
     COLOR_CHANNELS, DETAIL_CHANNELS, FEATURE_CHANNELS, Head, Input, LEVELS, ModelConfig,
     channels_of,

@@ -7,7 +7,8 @@ use demc_kernels::conv3x3::Tile;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{BandPlan, forward_with};
+use super::forward_with;
+use super::pass::BandPlan;
 use crate::{Denoiser, Head, ModelConfig, Ops, Reading, Variant};
 
 /// More rows than any image here, so no bands.
