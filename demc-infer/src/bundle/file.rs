@@ -276,9 +276,10 @@ fn parse_network(
     problems.extend(statistics_problems(&meta));
     let layout = meta.layout.validate().into_iter();
     problems.extend(layout.map(|problem| format!("layout: {problem}")));
-    match problems.is_empty() {
-        true => Ok(meta),
-        false => Err(invalid(problems.join("; "))),
+    if problems.is_empty() {
+        Ok(meta)
+    } else {
+        Err(invalid(problems.join("; ")))
     }
 }
 

@@ -143,9 +143,10 @@ impl Arguments {
                 message::status(format_args!("{output}: ONNX graph, read back and compared"));
             }
         }
-        match self.verify {
-            true => self.verify(&bundle.rounded(precision)?),
-            false => Ok(()),
+        if self.verify {
+            self.verify(&bundle.rounded(precision)?)
+        } else {
+            Ok(())
         }
     }
 

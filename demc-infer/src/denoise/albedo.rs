@@ -77,9 +77,10 @@ impl FrameInput<'_> {
             for (column, value) in filtered.iter_mut().enumerate() {
                 let column = column.min(frame.width - 1);
                 // Without a surface there is nothing to filter; neighbours would bleed in.
-                *value = match albedo.iter().any(|channel| channel[column] > 0.0) {
-                    true => value.min(MAX_ALBEDO),
-                    false => 0.0,
+                *value = if albedo.iter().any(|channel| channel[column] > 0.0) {
+                    value.min(MAX_ALBEDO)
+                } else {
+                    0.0
                 };
             }
         });

@@ -180,17 +180,15 @@ impl<'a> FrameInput<'a> {
             Head::Kernel => 1.0,
             _ => 0.5,
         };
-        let denoised = alpha
-            .iter()
-            .enumerate()
-            .map(|(i, rendered)| match varies[i] {
-                false => *rendered,
-                true => {
-                    let channels = (0..COLOR_CHANNELS).map(|channel| image[channel * pixels + i]);
-                    let mean = channels.sum::<f32>() / COLOR_CHANNELS as f32;
-                    (1.0 - share) * rendered + share * mean.clamp(0.0, 1.0)
-                }
-            });
+        let denoised = alpha.iter().enumerate().map(|(i, rendered)| {
+            if varies[i] {
+                let channels = (0..COLOR_CHANNELS).map(|channel| image[channel * pixels + i]);
+                let mean = channels.sum::<f32>() / COLOR_CHANNELS as f32;
+                (1.0 - share) * rendered + share * mean.clamp(0.0, 1.0)
+            } else {
+                *rendered
+            }
+        });
         Ok(Some(denoised.collect()))
     }
 
@@ -235,12 +233,11 @@ impl<'a> FrameInput<'a> {
             out.map_err(cancelled)
         };
         let inputs = [color_gamma, features_z];
-        let (out, filtered) = match self.layers.is_empty() {
-            true => {
-                let forward = |inputs| forward(inputs, None).map(|(out, _)| out);
-                (self.ensemble.mean(inputs, forward)?, None)
-            }
-            false => forward(inputs, Some(layers.input(self.padding, &self.device)))?,
+        let (out, filtered) = if self.layers.is_empty() {
+            let forward = |inputs| forward(inputs, None).map(|(out, _)| out);
+            (self.ensemble.mean(inputs, forward)?, None)
+        } else {
+            forward(inputs, Some(layers.input(self.padding, &self.device)))?
         };
         let mut out = self.read(out)?;
         in_pieces(&mut out, modulation.as_deref(), |out, modulation| {
@@ -270,17 +267,14 @@ impl<'a> FrameInput<'a> {
             return (None, Tensor::<4>::zeros([1; 4], &self.device).expand(shape));
         }
         let mut features = self.features(rows, columns);
-        let modulation = match self.demodulate {
-            true if demodulates => {
-                let pixels = rows.len() * columns.len();
-                let mut albedo = features[TEXTURES * pixels..][..COLOR_CHANNELS * pixels].to_vec();
-                in_pieces(&mut albedo, None, |albedo, _| {
-                    meta.normalizer.modulation_from_albedo(albedo);
-                });
-                Some(albedo)
-            }
-            _ => None,
-        };
+        let modulation = (self.demodulate && demodulates).then(|| {
+            let pixels = rows.len() * columns.len();
+            let mut albedo = features[TEXTURES * pixels..][..COLOR_CHANNELS * pixels].to_vec();
+            in_pieces(&mut albedo, None, |albedo, _| {
+                meta.normalizer.modulation_from_albedo(albedo);
+            });
+            albedo
+        });
         meta.normalizer.features_z_from_raw(&mut features);
         let features_z = self.tensor::<FEATURES>(features, rows, columns);
         (modulation, features_z)

@@ -165,9 +165,10 @@ impl GraphBuilder {
         let parts: Vec<&Value> = std::iter::once(&decoded).chain(&skips).collect();
         let all = self.concat(&format!("{}.concat", decoded.0), &parts);
         let fused = self.conv(&all, &level.fuse, None);
-        match level.activated_fusion {
-            true => self.relu(&fused),
-            false => fused,
+        if level.activated_fusion {
+            self.relu(&fused)
+        } else {
+            fused
         }
     }
 

@@ -36,9 +36,10 @@ impl Leaf for PackTaps<'_> {
             transposed,
             ..
         } = self;
-        let (depth, columns, lanes_of) = match transposed {
-            false => (inputs, 4 * outputs, outputs),
-            true => (4 * outputs, inputs, inputs),
+        let (depth, columns, lanes_of) = if transposed {
+            (4 * outputs, inputs, inputs)
+        } else {
+            (inputs, 4 * outputs, outputs)
         };
         let panels = Panels::new::<S>(columns);
         // Adjacent outputs in the file are read together, one cache line each.
@@ -94,9 +95,10 @@ pub(super) fn packed(
     outputs: usize,
     transposed: bool,
 ) -> [Packed; 4] {
-    let (depth, columns, count) = match transposed {
-        false => (inputs, 4 * outputs, inputs),
-        true => (4 * outputs, inputs, outputs),
+    let (depth, columns, count) = if transposed {
+        (4 * outputs, inputs, outputs)
+    } else {
+        (inputs, 4 * outputs, inputs)
     };
     let mut packed = TAPS.map(|_| Packed::empty(depth, columns));
     let [a, b, c, d] = &mut packed;

@@ -195,9 +195,10 @@ fn every_call_of_the_observer_can_cancel() {
         let mut calls = 0;
         let mut observer = |_| {
             calls += 1;
-            match calls == stop {
-                true => ControlFlow::Break(()),
-                false => ControlFlow::Continue(()),
+            if calls == stop {
+                ControlFlow::Break(())
+            } else {
+                ControlFlow::Continue(())
             }
         };
         let size = [1, 96, 64];
