@@ -131,10 +131,11 @@ pub extern "C" fn demcVersion() -> *const c_char {
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn demcNewDevice(name: *const c_char, num_threads: c_int) -> DemcDevice {
     guarded(None, ptr::null_mut(), || {
-        let name = match name.is_null() {
-            true => "flex",
+        let name = if name.is_null() {
+            "flex"
+        } else {
             // SAFETY: the caller passes a string.
-            false => unsafe { handle::text("name of the device", name)? },
+            unsafe { handle::text("name of the device", name)? }
         };
         Device::new(name, num_threads).map(handle::new)
     })
@@ -170,7 +171,7 @@ pub unsafe extern "C" fn demcGetDeviceError(
 ) -> DemcError {
     // SAFETY: the caller passes NULL or a handle with a reference.
     let device = unsafe { handle::shared("device", device) }.ok();
-    let (code, text) = fetch(device.as_deref());
+    let (code, text) = fetch(device.as_ref().map(|device| &device.errors));
     if !message.is_null() {
         // SAFETY: the caller passes NULL or a pointer to write to.
         unsafe { ptr::write(message, text) };

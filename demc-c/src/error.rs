@@ -13,8 +13,6 @@ use demc_infer::buffers::BufferError;
 use demc_infer::{BundleError, DenoiseError, DeviceError};
 use demc_program::message::printable;
 
-use crate::device::Device;
-
 /// Why a call failed. The first six codes have the numbers of Open Image Denoise.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -166,12 +164,15 @@ thread_local! {
     static WITHOUT_DEVICE: RefCell<ThreadError> = RefCell::default();
 }
 
-/// Applies `work` to this thread's error for the device, or to that without a device. Returns
+/// Applies `work` to this thread's error in those of a device, or to that without a device. Returns
 /// `None` while the thread ends.
-fn with_error<T>(device: Option<&Device>, work: impl FnOnce(&mut ThreadError) -> T) -> Option<T> {
+fn with_error<T>(
+    device: Option<&ThreadErrors>,
+    work: impl FnOnce(&mut ThreadError) -> T,
+) -> Option<T> {
     match device {
-        Some(device) => {
-            let errors = device.errors.0.lock();
+        Some(errors) => {
+            let errors = errors.0.lock();
             let mut errors = errors.unwrap_or_else(PoisonError::into_inner);
             Some(work(errors.entry(THREAD.with(|id| *id)).or_default()))
         }
@@ -185,7 +186,7 @@ fn with_error<T>(device: Option<&Device>, work: impl FnOnce(&mut ThreadError) ->
 /// Runs the body of a call. A failure or a panic becomes this thread's error for the device, and the
 /// call returns `otherwise`.
 pub(crate) fn guarded<T>(
-    device: Option<&Device>,
+    device: Option<&ThreadErrors>,
     otherwise: T,
     work: impl FnOnce() -> Result<T, Failure>,
 ) -> T {
@@ -199,7 +200,7 @@ pub(crate) fn guarded<T>(
 
 /// The first error of this thread for the device, or without one, which is then none. The message
 /// lives until the thread's next call or the end of the device.
-pub(crate) fn fetch(device: Option<&Device>) -> (DemcError, *const c_char) {
+pub(crate) fn fetch(device: Option<&ThreadErrors>) -> (DemcError, *const c_char) {
     let fetched = with_error(device, ThreadError::fetch);
     fetched.unwrap_or((DemcError::None, c"".as_ptr()))
 }

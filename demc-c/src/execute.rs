@@ -160,9 +160,12 @@ impl<'a> Images<'a> {
             layers: self.read_layers()?,
             ..DenoiseOptions::default()
         };
-        let observer = |done: DenoiseProgress| match callback(|| settings.report(done.share)) {
-            true => ControlFlow::Continue(()),
-            false => ControlFlow::Break(()),
+        let observer = |done: DenoiseProgress| {
+            if callback(|| settings.report(done.share)) {
+                ControlFlow::Continue(())
+            } else {
+                ControlFlow::Break(())
+            }
         };
         let denoised = bundle.denoise_with(&frame, &options, observer)?;
         self.write("output", &self.output, &denoised.color_hdr)?;

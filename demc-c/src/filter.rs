@@ -48,7 +48,7 @@ impl Filter {
 unsafe fn with_filter(filter: DemcFilter, work: impl FnOnce(&Filter) -> Result<(), Failure>) {
     // SAFETY: guaranteed by the caller.
     match unsafe { handle::shared("filter", filter) } {
-        Ok(filter) => guarded(Some(&filter.model.device), (), || work(&filter)),
+        Ok(filter) => guarded(Some(&filter.model.device.errors), (), || work(&filter)),
         Err(failure) => guarded(None, (), || Err(failure)),
     }
 }
@@ -69,7 +69,7 @@ pub unsafe extern "C" fn demcNewFilter(device: DemcDevice, model: DemcModel) -> 
         Ok(device) => device,
         Err(failure) => return guarded(None, ptr::null_mut(), || Err(failure)),
     };
-    guarded(Some(&device), ptr::null_mut(), || {
+    guarded(Some(&device.errors), ptr::null_mut(), || {
         // SAFETY: as above.
         let model = unsafe { handle::shared("model", model)? };
         if !Arc::ptr_eq(&model.device, &device) {

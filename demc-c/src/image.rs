@@ -59,13 +59,14 @@ pub(crate) fn check_name(name: &str) -> Result<(), Failure> {
     let layer = name.strip_prefix(LAYER);
     let layer = layer.or_else(|| name.strip_prefix(OUTPUT_LAYER));
     let is_known = layer.is_some_and(|layer| !layer.is_empty());
-    match is_known || THREE.contains(&name) || ONE.contains(&name) {
-        true => Ok(()),
-        false => Err(Failure::argument(format!(
+    if is_known || THREE.contains(&name) || ONE.contains(&name) {
+        Ok(())
+    } else {
+        Err(Failure::argument(format!(
             "no image is called `{name}`; images are {}, {}, {LAYER}NAME, and {OUTPUT_LAYER}NAME",
             THREE.join(", "),
             ONE.join(", ")
-        ))),
+        )))
     }
 }
 
@@ -140,11 +141,12 @@ impl Image {
             shape: [channels, height, width],
             strides,
         };
-        match image.is_addressable(data, layout.offset) {
-            true => Ok(image),
-            false => Err(Failure::argument(format!(
+        if image.is_addressable(data, layout.offset) {
+            Ok(image)
+        } else {
+            Err(Failure::argument(format!(
                 "{name} reaches outside of the address space"
-            ))),
+            )))
         }
     }
 

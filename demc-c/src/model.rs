@@ -44,7 +44,7 @@ unsafe fn new_model(
 ) -> DemcModel {
     // SAFETY: guaranteed by the caller.
     match unsafe { handle::shared("device", device) } {
-        Ok(device) => guarded(Some(&device), ptr::null_mut(), || {
+        Ok(device) => guarded(Some(&device.errors), ptr::null_mut(), || {
             make(&device).map(handle::new)
         }),
         Err(failure) => guarded(None, ptr::null_mut(), || Err(failure)),

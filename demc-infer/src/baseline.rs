@@ -77,13 +77,14 @@ impl Baseline {
         let path = self.path(scene);
         let image = read_rgb(&path)?;
         let size = (image.width, image.height);
-        match size == (scene.width, scene.height) {
-            true => Ok(image),
-            false => Err(BaselineError::Size {
+        if size == (scene.width, scene.height) {
+            Ok(image)
+        } else {
+            Err(BaselineError::Size {
                 path,
                 found: format!("{}x{}", size.0, size.1),
                 expected: format!("{}x{}", scene.width, scene.height),
-            }),
+            })
         }
     }
 }

@@ -35,9 +35,10 @@ const ASSUMED_BUDGET: u64 = 4 << 30;
 
 /// Bytes that a pass on `device` may use; `None` if unknown.
 pub fn budget(device: &Device) -> Option<u64> {
-    match *device == Device::flex() {
-        true => available(),
-        false => Some(ASSUMED_BUDGET),
+    if *device == Device::flex() {
+        available()
+    } else {
+        Some(ASSUMED_BUDGET)
     }
 }
 

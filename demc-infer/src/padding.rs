@@ -10,6 +10,9 @@ use demc_model::DOWNSAMPLING;
 
 use crate::tiles::Span;
 
+/// Rows or columns of the padded image, in pixels.
+pub(crate) type PixelRange = Range<usize>;
+
 /// The sizes of an image before and after padding, in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Padding {

@@ -244,9 +244,10 @@ impl Rows {
 
 /// The halved row or column that contributes a quarter to the doubled one.
 fn neighbour(doubled: usize, length: usize) -> usize {
-    match doubled.is_multiple_of(2) {
-        true => (doubled / 2).saturating_sub(1),
-        false => (doubled / 2 + 1).min(length - 1),
+    if doubled.is_multiple_of(2) {
+        (doubled / 2).saturating_sub(1)
+    } else {
+        (doubled / 2 + 1).min(length - 1)
     }
 }
 

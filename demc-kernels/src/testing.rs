@@ -4,16 +4,17 @@ use crate::Grid;
 
 /// Odd sizes, a single pixel, single rows and columns, a batch.
 pub(crate) fn grids() -> Vec<Grid> {
-    let sizes = match cfg!(miri) {
-        true => vec![(1, 1, 1), (2, 3, 5)],
-        false => vec![
+    let sizes = if cfg!(miri) {
+        vec![(1, 1, 1), (2, 3, 5)]
+    } else {
+        vec![
             (1, 1, 1),
             (1, 1, 7),
             (3, 5, 1),
             (2, 7, 9),
             (1, 32, 32),
             (3, 2, 2),
-        ],
+        ]
     };
     all(sizes)
 }

@@ -135,9 +135,10 @@ impl DecoderLevel {
             None => below.deconv4x4(&self.deconv, Activation::Relu),
         };
         let parts = std::iter::once(decoded).chain(skips).collect();
-        let activation = match self.activated_fusion {
-            true => Activation::Relu,
-            false => Activation::None,
+        let activation = if self.activated_fusion {
+            Activation::Relu
+        } else {
+            Activation::None
         };
         Maps::fuse(parts, &self.fuse, activation)
     }

@@ -86,12 +86,13 @@ impl Denoiser {
     ) -> Result<Self, WeightsError> {
         let spec = config.variant.spec();
         let deepest = config.level_channels()[LEVELS - 1];
-        let fusion = match spec.has_fusion() {
-            true => Some(
+        let fusion = if spec.has_fusion() {
+            Some(
                 b.enter(Stage::Fusion)
                     .part("fusion", |b| Fusion::build(b, config.width, config.detail))?,
-            ),
-            false => None,
+            )
+        } else {
+            None
         };
         let encoders = b.list("encoders", spec.encoders.len(), |b, e| {
             Encoder::build(b, config, e, channels_of(spec.encoders[e]))

@@ -68,9 +68,10 @@ impl Denoiser {
         if let Some(layers) = &layers {
             self.assert_layers(color_gamma.dims(), layers.dims());
         }
-        match self.infers_on(&color_gamma.device()) {
-            true => inference::forward(self, color_gamma, features_z, layers, observer),
-            false => Ok(self.run_modules(color_gamma, features_z, layers)),
+        if self.infers_on(&color_gamma.device()) {
+            inference::forward(self, color_gamma, features_z, layers, observer)
+        } else {
+            Ok(self.run_modules(color_gamma, features_z, layers))
         }
     }
 

@@ -80,12 +80,11 @@ pub(crate) fn forward(
         });
     }
     let out = out.expect("a kernel head has levels");
-    let (color, layers) = match has_layers {
-        false => (out, None),
-        true => {
-            let (color, layers) = out.split_first();
-            (color, Some(layers))
-        }
+    let (color, layers) = if has_layers {
+        let (color, layers) = out.split_first();
+        (color, Some(layers))
+    } else {
+        (out, None)
     };
     (color.gamma(GAMMA, DARKEST), layers)
 }

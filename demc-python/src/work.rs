@@ -51,9 +51,10 @@ impl<M> Caller<M> {
                 }
             }
         }
-        match self.is_stopped() {
-            true => ControlFlow::Break(()),
-            false => ControlFlow::Continue(()),
+        if self.is_stopped() {
+            ControlFlow::Break(())
+        } else {
+            ControlFlow::Continue(())
         }
     }
 
@@ -140,12 +141,13 @@ pub fn run<M: Send, R: Send>(
 fn check_process() -> PyResult<()> {
     static STARTED_IN: OnceLock<u32> = OnceLock::new();
     let own = std::process::id();
-    match *STARTED_IN.get_or_init(|| own) == own {
-        true => Ok(()),
-        false => Err(PyRuntimeError::new_err(
+    if *STARTED_IN.get_or_init(|| own) == own {
+        Ok(())
+    } else {
+        Err(PyRuntimeError::new_err(
             "demc was used before this process was forked, so its threads are missing here; \
              start processes with the method \"spawn\" of multiprocessing",
-        )),
+        ))
     }
 }
 

@@ -61,9 +61,10 @@ fn check(set: &Dataset) {
         assert_eq!((scene.width, scene.height), SIZE);
         assert!(names.insert(&scene.name));
         let file = fs::canonicalize(&scene.path).expect("it was checked");
-        let file = match file.ends_with("link.exr") {
-            true => ROOT.join("a.exr"),
-            false => file,
+        let file = if file.ends_with("link.exr") {
+            ROOT.join("a.exr")
+        } else {
+            file
         };
         assert!(files.insert(file));
         assert_eq!(

@@ -18,9 +18,10 @@ pub fn check_message(error: &dyn std::error::Error, name: &str) {
 /// A new directory, in memory if available, for targets that write files.
 pub fn scratch() -> PathBuf {
     let memory = Path::new("/dev/shm");
-    let parent = match memory.is_dir() {
-        true => memory.to_owned(),
-        false => std::env::temp_dir(),
+    let parent = if memory.is_dir() {
+        memory.to_owned()
+    } else {
+        std::env::temp_dir()
     };
     let dir = parent.join(format!("demc-fuzz-{}", std::process::id()));
     std::fs::create_dir_all(&dir).expect("a writable directory");

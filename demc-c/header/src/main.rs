@@ -41,9 +41,10 @@ fn main() -> ExitCode {
     };
     let path = root.join("include/demc.h");
     let is_check = env::args().nth(1).as_deref() == Some("--check");
-    let done = match is_check {
-        true => fs::read_to_string(&path).map(|old| old == header),
-        false => fs::write(&path, &header).map(|()| true),
+    let done = if is_check {
+        fs::read_to_string(&path).map(|old| old == header)
+    } else {
+        fs::write(&path, &header).map(|()| true)
     };
     match done {
         Ok(true) => ExitCode::SUCCESS,

@@ -75,9 +75,10 @@ pub fn unusable(found: &[(String, Vec<ContentProblem>)]) -> Vec<String> {
         (scene.clone(), fatal.cloned().collect::<Vec<_>>())
     });
     let fatal: Vec<_> = fatal.collect();
-    match fatal.iter().any(|(_, problems)| problems.is_empty()) {
-        true => Vec::new(),
-        false => by_problem(&fatal),
+    if fatal.iter().any(|(_, problems)| problems.is_empty()) {
+        Vec::new()
+    } else {
+        by_problem(&fatal)
     }
 }
 
@@ -106,9 +107,12 @@ mod tests {
         let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
         let found = |color, reference, feature| {
             let found = suspicious(&planes(color, reference, feature), &layout);
-            let phrases = found.into_iter().map(|problem| match problem.is_fatal {
-                true => problem.text + "!",
-                false => problem.text,
+            let phrases = found.into_iter().map(|problem| {
+                if problem.is_fatal {
+                    problem.text + "!"
+                } else {
+                    problem.text
+                }
             });
             phrases.collect::<Vec<_>>().join("; ")
         };

@@ -235,9 +235,10 @@ mod tests {
                 } else {
                     f32::INFINITY
                 };
-                let (distance, normal) = match floor < wall {
-                    true => (floor, [0.0, 1.0, 0.0]),
-                    false => (wall, [0.0, 0.0, 1.0]),
+                let (distance, normal) = if floor < wall {
+                    (floor, [0.0, 1.0, 0.0])
+                } else {
+                    (wall, [0.0, 0.0, 1.0])
                 };
                 for channel in 0..3 {
                     let i = y * SIDE + x;

@@ -58,9 +58,10 @@ impl ChannelMoments {
 pub(crate) fn median(values: impl Iterator<Item = f32>) -> Option<f32> {
     let mut values: Vec<f32> = values.collect();
     let middle = values.len() / 2;
-    match values.is_empty() {
-        true => None,
-        false => Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1),
+    if values.is_empty() {
+        None
+    } else {
+        Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
     }
 }
 

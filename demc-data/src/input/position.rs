@@ -67,9 +67,10 @@ impl PositionMap {
             let hit = self.extent > 0.0 && is_hit(features, pixels, i);
             for (axis, center) in self.center.into_iter().enumerate() {
                 let value = &mut features[(POSITIONS + axis) * pixels + i];
-                *value = match hit {
-                    true => ((*value - center) / self.extent).clamp(-FARTHEST, FARTHEST),
-                    false => 0.0,
+                *value = if hit {
+                    ((*value - center) / self.extent).clamp(-FARTHEST, FARTHEST)
+                } else {
+                    0.0
                 };
             }
         }

@@ -47,9 +47,12 @@ impl Dropout {
 
     /// What replaces the buffers that a network trained with this dropout can do without.
     pub fn missing(&self) -> MissingPolicies {
-        let policy = |probability, policy| match probability > 0.0 {
-            true => policy,
-            false => Missing::Error,
+        let policy = |probability, policy| {
+            if probability > 0.0 {
+                policy
+            } else {
+                Missing::Error
+            }
         };
         MissingPolicies {
             normal: policy(self.normal, Missing::Zeros),

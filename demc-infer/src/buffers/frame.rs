@@ -5,7 +5,8 @@ use demc_data::image::exr::check_size;
 use demc_data::image::frame::{self, FEATURES, POSITIONS};
 use demc_data::image::layout::Missing;
 
-use super::{BufferError, View};
+use super::error::BufferError;
+use super::view::View;
 use crate::Bundle;
 use crate::denoise::Layer;
 

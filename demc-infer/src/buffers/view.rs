@@ -3,7 +3,7 @@
 use half::f16;
 use rayon::prelude::*;
 
-use super::{BufferError, Shape};
+use super::error::{BufferError, Shape};
 
 /// Type of samples, in the machine's byte order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -60,12 +60,13 @@ impl Placement {
         }
         let (low, high) = extent(self.sample, shape, self.strides);
         let first = first as i128;
-        match first + low >= 0 && first + high <= bytes as i128 {
-            true => Ok(self),
-            false => Err(BufferError::Outside {
+        if first + low >= 0 && first + high <= bytes as i128 {
+            Ok(self)
+        } else {
+            Err(BufferError::Outside {
                 shape: Shape(shape),
                 bytes,
-            }),
+            })
         }
     }
 

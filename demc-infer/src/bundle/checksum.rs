@@ -11,7 +11,7 @@ use demc_program::checksum::sha256;
 use demc_program::message::printable;
 use safetensors::SafeTensors;
 
-use super::BundleError;
+use super::error::BundleError;
 
 /// File of a checkpoint with the checksums of its other files, as `sha256sum` writes it.
 pub const SUMS: &str = "SHA256SUMS";
@@ -60,13 +60,15 @@ pub(super) fn check(
     let views =
         views.map(|(name, view)| SummedTensor::new(name, view.dtype(), view.shape(), view.data()));
     // An empty checksum is one of the ways in which the digits can be damaged.
-    let blank = match sum.is_empty() {
-        true => String::new(),
-        false => entry.replacen(sum, "", 1),
+    let blank = if sum.is_empty() {
+        String::new()
+    } else {
+        entry.replacen(sum, "", 1)
     };
-    match of_bundle(&blank, views.collect()) == sum {
-        true => Ok(()),
-        false => Err(BundleError::Checksum { path: path.into() }),
+    if of_bundle(&blank, views.collect()) == sum {
+        Ok(())
+    } else {
+        Err(BundleError::Checksum { path: path.into() })
     }
 }
 
@@ -94,9 +96,10 @@ pub fn sums(dir: &Path) -> Result<Vec<(String, String)>, BundleError> {
         }
     });
     let pairs: Vec<_> = pairs.collect::<Result<_, _>>()?;
-    match pairs.is_empty() {
-        true => Err(invalid("empty".into())),
-        false => Ok(pairs),
+    if pairs.is_empty() {
+        Err(invalid("empty".into()))
+    } else {
+        Ok(pairs)
     }
 }
 

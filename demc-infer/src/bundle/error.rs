@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use demc_model::WeightsError;
 use demc_program::file::FileError;
 
-use super::FORMAT;
+use super::meta::FORMAT;
 
 /// Why a bundle cannot be written or read.
 #[derive(Debug, thiserror::Error)]

@@ -14,10 +14,14 @@ use safetensors::tensor::{Dtype, Metadata};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
+use super::bundled::Bundled;
 use super::encode::KEY;
-use super::filter::FILTER_KEY;
+use super::error::BundleError;
+use super::meta::{BundleMeta, FORMAT};
+use super::names::{Names, Precision};
+use super::network::{FILTER_KEY, PREFIX};
 use super::tensors::values;
-use super::{BundleError, BundleMeta, FORMAT, Names, PREFIX, Precision, checksum, locate};
+use super::{checksum, locate};
 
 /// Longest accepted header in bytes (ours: the widest network's has 20 kB).
 const MAX_HEADER: u64 = 4 << 20;
@@ -47,44 +51,6 @@ pub struct BundleFile {
     pub albedo_filter: Option<Box<BundleFile>>,
 }
 
-/// A model for 1 to 256 samples per pixel that is inside the program. `models/README.md` describes
-/// them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Bundled {
-    /// The smaller error.
-    #[default]
-    Quality,
-    /// Less than half the time.
-    Fast,
-}
-
-impl Bundled {
-    /// All bundled models.
-    pub const ALL: [Self; 2] = [Self::Quality, Self::Fast];
-
-    /// Its name, where a program or function takes a model.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Quality => "quality",
-            Self::Fast => "fast",
-        }
-    }
-
-    /// The bundled model that `path` names.
-    pub(super) fn named(path: &Path) -> Option<Self> {
-        Self::ALL
-            .into_iter()
-            .find(|model| path.as_os_str() == model.name())
-    }
-
-    const fn bytes(self) -> &'static [u8] {
-        match self {
-            Self::Quality => include_bytes!("../../../models/quality.safetensors"),
-            Self::Fast => include_bytes!("../../../models/fast.safetensors"),
-        }
-    }
-}
-
 impl BundleFile {
     /// A bundled model.
     ///
@@ -94,7 +60,7 @@ impl BundleFile {
         Self::parse(model.name().into(), model.bytes())
     }
 
-    /// Reads a run directory, a checkpoint directory or a bundle file; see [`super::Bundle::load`].
+    /// Reads a run directory, a checkpoint directory or a bundle file; see [`Bundle::load`](super::Bundle::load).
     /// The path `quality` or `fast` is the bundled model of that name; `./fast` is a file.
     ///
     /// # Errors
@@ -310,9 +276,10 @@ fn parse_network(
     problems.extend(statistics_problems(&meta));
     let layout = meta.layout.validate().into_iter();
     problems.extend(layout.map(|problem| format!("layout: {problem}")));
-    match problems.is_empty() {
-        true => Ok(meta),
-        false => Err(invalid(problems.join("; "))),
+    if problems.is_empty() {
+        Ok(meta)
+    } else {
+        Err(invalid(problems.join("; ")))
     }
 }
 

@@ -8,9 +8,11 @@ use demc_program::message::printable;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 
-use super::file::{damaged, parse_meta, read};
+use super::error::BundleError;
+use super::file::{BundleFile, damaged, parse_meta, read};
+use super::names::{Names, Precision};
+use super::network::PREFIX;
 use super::tensors::values;
-use super::{BundleError, BundleFile, Names, PREFIX, Precision};
 
 /// Invalid tensors by kind of problem.
 #[derive(Default)]

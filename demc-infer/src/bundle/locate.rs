@@ -12,7 +12,8 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::{BundleError, Bundled};
+use super::bundled::Bundled;
+use super::error::BundleError;
 
 /// Best weights of a run, by validation.
 pub const BEST: &str = "best.safetensors";

@@ -13,116 +13,34 @@
 //! A bundle may contain a second network, the albedo filter. Its tensors have the prefix
 //! `albedo_filter.`, and the header entry has its [`BundleMeta`] as `albedo_filter`.
 
+mod bundled;
 pub mod checksum;
 mod encode;
 mod error;
 mod file;
-mod filter;
 mod import;
 pub mod locate;
+mod meta;
+mod names;
+mod network;
 pub mod tensors;
 
 use std::io::Write;
 use std::path::Path;
 
 use burn::tensor::Device;
-use demc_data::image::layout::{Missing, MissingPolicies};
-use demc_data::{ChannelLayout, Normalizer, Ranges};
-use demc_model::{Denoiser, ModelConfig, Weights, WeightsError};
-use serde::{Deserialize, Serialize};
+use demc_model::{Weights, WeightsError};
 
+pub use bundled::Bundled;
 pub(crate) use encode::Description;
-pub use encode::{Names, Precision};
 pub use error::BundleError;
-pub use file::{BundleFile, Bundled};
-pub(crate) use filter::PREFIX;
-
-/// The bundle format that this build writes and reads. It increases when a tensor's name or meaning
-/// changes.
-pub const FORMAT: u32 = 1;
-
-/// Everything about a network except its weights.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct BundleMeta {
-    /// Bundle format, [`FORMAT`].
-    pub format: u32,
-    /// Variant, reading and width.
-    pub model: ModelConfig,
-    /// Gamma and the training set's statistics.
-    pub normalizer: Normalizer,
-    /// Which channels of a renderer's files hold the 15 planes.
-    pub layout: ChannelLayout,
-    /// Number of optimizer steps behind the weights.
-    pub step: u64,
-    /// Ranges of the training scenes' statistics, which [`guard`](crate::guard) uses; `None` if
-    /// unknown.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub ranges: Option<Ranges>,
-}
-
-impl BundleMeta {
-    /// Metadata in the current [`FORMAT`].
-    pub fn new(
-        model: ModelConfig,
-        normalizer: Normalizer,
-        layout: ChannelLayout,
-        step: u64,
-    ) -> Self {
-        Self {
-            format: FORMAT,
-            model,
-            normalizer,
-            layout,
-            step,
-            ranges: None,
-        }
-    }
-
-    /// Adds the ranges of the training scenes' statistics.
-    pub fn with_ranges(self, ranges: Ranges) -> Self {
-        Self {
-            ranges: Some(ranges),
-            ..self
-        }
-    }
-}
-
-/// A network ready to denoise, with its metadata.
-///
-/// The model must be on a device without autodiff. With autodiff, batch normalisation would use the
-/// current image's statistics.
-#[derive(Debug, Clone)]
-pub struct Bundle {
-    /// Everything about the network except its weights.
-    pub meta: BundleMeta,
-    /// The network.
-    pub model: Denoiser,
-    /// A second network, which denoises the first hit's albedo before this one sees it. It has no
-    /// filter of its own.
-    pub albedo_filter: Option<Box<Bundle>>,
-}
+pub use file::BundleFile;
+pub use meta::{BundleMeta, FORMAT};
+pub use names::{Names, Precision};
+pub use network::Bundle;
+pub(crate) use network::PREFIX;
 
 impl Bundle {
-    /// A network without an albedo filter.
-    pub fn new(meta: BundleMeta, model: Denoiser) -> Self {
-        Self {
-            meta,
-            model,
-            albedo_filter: None,
-        }
-    }
-
-    /// The feature buffers that a file may lack, and what replaces them. The policies are those of
-    /// the training's layout. Without one, texture1 replaces texture2 and zeros the position.
-    /// With the bundled models these two changed the error by less than 3 %.
-    pub fn missing(&self) -> MissingPolicies {
-        self.meta.layout.missing.or(MissingPolicies {
-            position: Missing::Zeros,
-            texture2: Missing::CopyTexture1,
-            ..MissingPolicies::default()
-        })
-    }
-
     /// Writes the bundle to `path` atomically, with mode 0644. Equal bundles give equal bytes.
     ///
     /// # Errors

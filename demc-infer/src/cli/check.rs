@@ -12,11 +12,12 @@ use demc_data::{Frame, FrameSummary};
 use demc_program::message::{self, printable};
 use serde::Serialize;
 
+use super::clamped::Clamped;
 use super::flags::{DeviceFlag, ModelFlag};
 use super::frames::Frames;
 use super::inputs::Inputs;
 use super::layouts::{LayoutFlags, Layouts, say};
-use super::{Clamped, utf8_for_json};
+use super::outputs::utf8_for_json;
 use crate::Bundle;
 
 /// Compare images with a model's training data: statistics of each channel, and warnings.

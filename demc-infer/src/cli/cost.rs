@@ -115,9 +115,10 @@ impl Arguments {
             available_bytes: tiling.memory.or_else(|| bundle.memory_budget()),
             images,
         };
-        let text = match self.json {
-            true => message::json(&report)?,
-            false => report.text(),
+        let text = if self.json {
+            message::json(&report)?
+        } else {
+            report.text()
         };
         message::result(&text)?;
         anyhow::ensure!(failed == 0, "{failed} of {count} images have no cost");

@@ -11,7 +11,7 @@ use demc_data::image::rewrite::{OutputChannels, WriteOptions, rewrite_with_layer
 use demc_program::message;
 use demc_program::output::{Directories, Outputs};
 
-use super::Clamped;
+use super::clamped::Clamped;
 use super::exposure::{InputScaleFlag, SequenceScales, stops};
 use super::flags::{DeviceFlag, EnsembleFlag, LightFlag, ModelFlag, TilingFlags, describe};
 use super::frames::Frames;
@@ -120,9 +120,10 @@ impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let inputs = Inputs::expand(&self.inputs, self.frames.as_ref())?;
         // One worker of a farm reports them, not all.
-        let incomplete = match self.shard.is_none_or(Shard::is_first) {
-            true => inputs.report_missing(),
-            false => 0,
+        let incomplete = if self.shard.is_none_or(Shard::is_first) {
+            inputs.report_missing()
+        } else {
+            0
         };
         let mut jobs = Jobs::new(&inputs, &self.output, self.png)?;
         if let Some(shard) = self.shard {
@@ -150,9 +151,10 @@ impl Arguments {
         let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
         self.layers.check(&bundle, self.ensemble.passes)?;
-        outputs.prepare(match jobs.directory {
-            true => Directories::Create,
-            false => Directories::Expect,
+        outputs.prepare(if jobs.directory {
+            Directories::Create
+        } else {
+            Directories::Expect
         })?;
         let jobs = jobs.list;
         let progress = Progress::new(jobs.len());
@@ -207,9 +209,10 @@ impl Arguments {
         let layout = &layouts.of(&file, bundle, say)?;
         let names = self.layers.names(&file, layout)?;
         let mut file = file.keeping(&layout.color, cache_bytes());
-        let (mut frame, repaired) = match self.repair {
-            false => (decode_input(&mut file, layout)?, 0),
-            true => decode_repaired(&mut file, layout)?,
+        let (mut frame, repaired) = if self.repair {
+            decode_repaired(&mut file, layout)?
+        } else {
+            (decode_input(&mut file, layout)?, 0)
         };
         let (layers, more) = read_layers(&mut file, layout, &names, self.repair)?;
         if repaired + more > 0 {
@@ -330,9 +333,10 @@ impl OutputFlags {
         replaced: &Replaced,
     ) -> Result<Vec<String>, demc_data::Error> {
         let options = WriteOptions {
-            channels: match self.only_color {
-                true => OutputChannels::Color,
-                false => OutputChannels::All,
+            channels: if self.only_color {
+                OutputChannels::Color
+            } else {
+                OutputChannels::All
             },
             precision: self.precision.map(|precision| match precision {
                 OutputPrecision::Half => demc_data::SamplePrecision::Half,

@@ -4,11 +4,12 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use demc_model::metrics::{self, METRICS, Metric};
+use demc_program::exit::UsageError;
 use demc_program::message;
 use serde::Serialize;
 
-use super::UsageError;
-use super::scenes::Scenes;
+use super::outputs::write_text;
+use super::scenes::{Scenes, require_all};
 use crate::Report;
 use crate::evaluate::Difference;
 
@@ -74,9 +75,9 @@ impl Arguments {
                 report: &report,
                 differences,
             };
-            super::write_text(path, &message::json(&json)?)?;
+            write_text(path, &message::json(&json)?)?;
         }
-        super::scenes::require_all(&report)
+        require_all(&report)
     }
 }
 

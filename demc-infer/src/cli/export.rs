@@ -6,12 +6,13 @@ use std::path::{Path, PathBuf};
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
 use demc_data::ChannelLayout;
+use demc_program::exit::UsageError;
 use demc_program::message::{self, printable};
 use demc_program::output::Outputs;
 
 use super::flags::ModelFlag;
 use super::layouts::LAYOUT;
-use super::{UsageError, check_output};
+use super::outputs::check_output;
 use crate::bundle::locate;
 use crate::verify::{KERNEL_TOLERANCE, Runtime, TOLERANCE, verify};
 use crate::{Bundle, BundleFile, Names, Precision};
@@ -142,9 +143,10 @@ impl Arguments {
                 message::status(format_args!("{output}: ONNX graph, read back and compared"));
             }
         }
-        match self.verify {
-            true => self.verify(&bundle.rounded(precision)?),
-            false => Ok(()),
+        if self.verify {
+            self.verify(&bundle.rounded(precision)?)
+        } else {
+            Ok(())
         }
     }
 

@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use clap::Args;
 use demc_data::image::exr::MAX_SIDE;
+use demc_program::exit::UsageError;
 use demc_program::output::Outputs;
 
-use super::UsageError;
 use crate::bundle::locate;
 use crate::compute::ComputeFlags;
 use crate::tiles::EXACT_HALO;

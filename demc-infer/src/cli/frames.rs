@@ -137,9 +137,12 @@ impl Frames {
 
     /// As `1-2, 5`, with 20 parts at most.
     pub fn describe(&self) -> String {
-        let part = |run: &Run| match run.start() == run.end() {
-            true => run.start().to_string(),
-            false => format!("{}-{}", run.start(), run.end()),
+        let part = |run: &Run| {
+            if run.start() == run.end() {
+                run.start().to_string()
+            } else {
+                format!("{}-{}", run.start(), run.end())
+            }
         };
         let parts: Vec<String> = self.runs.iter().take(MAX_GAPS).map(part).collect();
         let more = if self.runs.len() > MAX_GAPS {

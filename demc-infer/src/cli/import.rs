@@ -7,7 +7,7 @@ use clap::Args;
 use demc_program::message::{self, printable};
 use demc_program::output::Outputs;
 
-use super::check_output;
+use super::outputs::check_output;
 use crate::bundle::locate;
 use crate::{BundleError, BundleFile, Names, Precision};
 

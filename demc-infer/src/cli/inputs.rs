@@ -4,9 +4,9 @@ use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use demc_program::exit::UsageError;
 use demc_program::message;
 
-use super::UsageError;
 use super::frames::Frames;
 
 /// The input images of a command line.

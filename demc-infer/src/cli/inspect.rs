@@ -11,7 +11,7 @@ use demc_program::message::{self, printable};
 use serde::Serialize;
 
 use super::flags::ModelFlag;
-use super::utf8_for_json;
+use super::outputs::utf8_for_json;
 use crate::{Bundle, BundleMeta, Names, Precision};
 
 /// Show a model: network, training step, statistics and input channels.
@@ -61,9 +61,10 @@ impl Arguments {
             utf8_for_json(&file)?;
         }
         let bundle = source.into_bundle(&Device::flex())?;
-        let tensors = match self.tensors {
-            true => bundle.tensors(names),
-            false => Vec::new(),
+        let tensors = if self.tensors {
+            bundle.tensors(names)
+        } else {
+            Vec::new()
         };
         let Bundle {
             meta,
@@ -84,9 +85,10 @@ impl Arguments {
             albedo_filter,
             tensors,
         };
-        let text = match self.json {
-            true => message::json(&summary)?,
-            false => summary.text()?,
+        let text = if self.json {
+            message::json(&summary)?
+        } else {
+            summary.text()?
         };
         Ok(message::result(&text)?)
     }

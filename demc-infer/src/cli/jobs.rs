@@ -5,9 +5,9 @@ use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use demc_program::exit::UsageError;
 use demc_program::output::{OutputError, Outputs};
 
-use super::UsageError;
 use super::inputs::Inputs;
 use super::shard::Shard;
 

@@ -4,10 +4,10 @@ use clap::Args;
 use demc_data::image::exr::ExrFile;
 use demc_data::image::frame::layers::{check_layers, decode_layers};
 use demc_data::{ChannelLayout, Error};
+use demc_program::exit::UsageError;
 use demc_program::message::list;
 use glob::Pattern;
 
-use super::UsageError;
 use crate::denoise::Layer;
 use crate::{Bundle, Ensemble};
 

@@ -7,10 +7,10 @@ use clap::Args;
 use demc_data::image::exr::ExrFile;
 use demc_data::image::layout::{FileLayout, Missing, detect};
 use demc_data::{ChannelLayout, Dataset, Error};
+use demc_program::exit::UsageError;
 use demc_program::message;
 use demc_program::output::Outputs;
 
-use super::UsageError;
 use crate::Bundle;
 
 /// What a layout file is called in messages about outputs.

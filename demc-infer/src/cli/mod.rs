@@ -4,6 +4,7 @@
 //! or of one of its files, 2 invalid command line.
 
 mod check;
+mod clamped;
 mod cost;
 mod denoise;
 mod evaluate;
@@ -17,6 +18,7 @@ mod inspect;
 mod jobs;
 mod layers;
 mod layouts;
+mod outputs;
 mod progress;
 mod report;
 mod scenes;
@@ -24,12 +26,9 @@ mod shard;
 mod warnings;
 
 use std::ffi::OsString;
-use std::path::Path;
 
 use clap::{CommandFactory, Parser, Subcommand};
-use demc_program::exit::{self, UsageError};
-use demc_program::message;
-use demc_program::output::{Directories, OutputError, Outputs};
+use demc_program::exit;
 
 use crate::compute;
 
@@ -90,55 +89,4 @@ fn run(arguments: Arguments) -> anyhow::Result<()> {
         Verb::Inspect(command) => command.run(),
         Verb::Report(command) => command.run(),
     }
-}
-
-/// Counts negative radiance samples, which are reported once for all images.
-#[derive(Default)]
-struct Clamped {
-    samples: usize,
-    images: usize,
-}
-
-impl Clamped {
-    fn count(&mut self, samples: usize) {
-        self.samples += samples;
-        self.images += usize::from(samples > 0);
-    }
-
-    fn report(self) {
-        let Self { samples, images } = self;
-        if samples > 0 {
-            message::say(format_args!(
-                "note: {samples} negative radiance sample(s) in {images} image(s) set to 0"
-            ));
-        }
-    }
-}
-
-/// Checks the only output of a command, which may replace a file, but no input.
-fn check_output(mut outputs: Outputs, path: &Path) -> Result<(), OutputError> {
-    outputs.claim(path, true)?;
-    outputs.prepare(Directories::Expect)
-}
-
-/// Fails for a path that JSON cannot hold.
-fn utf8_for_json(path: &Path) -> Result<(), UsageError> {
-    match path.to_str() {
-        Some(_) => Ok(()),
-        None => Err(UsageError(format!(
-            "{}: not UTF-8, as JSON requires; rename it or omit --json",
-            path.display()
-        ))),
-    }
-}
-
-/// Writes `text` and a newline to stdout if `path` is `-`, otherwise to a file.
-fn write_text(path: &Path, text: &str) -> anyhow::Result<()> {
-    if path == Path::new("-") {
-        return Ok(message::result(text)?);
-    }
-    demc_program::file::write_whole(path, |file| {
-        std::io::Write::write_all(file, format!("{text}\n").as_bytes())
-    })?;
-    Ok(())
 }

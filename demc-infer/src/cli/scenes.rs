@@ -4,14 +4,16 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use demc_data::{ChannelLayout, Dataset, Frame, Rgb, Scene};
+use demc_program::exit::UsageError;
 use demc_program::message::printable;
 use demc_program::output::Outputs;
 
+use super::clamped::Clamped;
 use super::exposure::InputScaleFlag;
 use super::flags::{DeviceFlag, EnsembleFlag, LightFlag, ModelFlag};
 use super::layouts::LayoutFlags;
+use super::outputs;
 use super::progress::Progress;
-use super::{Clamped, UsageError};
 use crate::denoise::{DenoiseError, DenoiseOptions, Denoised, unobserved};
 use crate::evaluate::FailedImage;
 use crate::report::SceneImages;
@@ -92,7 +94,7 @@ impl Scenes {
                 outputs.protect(&baseline.path(scene), &what);
             }
         }
-        Ok(super::check_output(outputs, path)?)
+        Ok(outputs::check_output(outputs, path)?)
     }
 
     /// Scores every scene of the split in all metrics, with one scene in memory at a time.

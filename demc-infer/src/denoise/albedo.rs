@@ -12,9 +12,11 @@ use demc_data::input::transform::MAX_ALBEDO;
 use demc_model::config::COLOR_CHANNELS;
 use rayon::prelude::*;
 
-use super::{DenoiseError, DenoiseObserver, DenoiseProgress, FrameInput, unobserved};
+use super::input::FrameInput;
+use super::progress::{DenoiseObserver, DenoiseProgress, unobserved};
 use crate::Bundle;
 use crate::ensemble::Ensemble;
+use crate::error::DenoiseError;
 use crate::padding::Padding;
 use crate::tiles::Tiling;
 
@@ -75,9 +77,10 @@ impl FrameInput<'_> {
             for (column, value) in filtered.iter_mut().enumerate() {
                 let column = column.min(frame.width - 1);
                 // Without a surface there is nothing to filter; neighbours would bleed in.
-                *value = match albedo.iter().any(|channel| channel[column] > 0.0) {
-                    true => value.min(MAX_ALBEDO),
-                    false => 0.0,
+                *value = if albedo.iter().any(|channel| channel[column] > 0.0) {
+                    value.min(MAX_ALBEDO)
+                } else {
+                    0.0
                 };
             }
         });

@@ -12,11 +12,11 @@ use demc_model::inference::Cancelled;
 use rayon::prelude::*;
 
 use super::layers::{Layer, LayerTile};
-use super::{DenoiseError, DenoiseObserver, DenoiseProgress};
+use super::progress::{DenoiseObserver, DenoiseProgress};
 use crate::Bundle;
 use crate::ensemble::Ensemble;
-use crate::error::check_sizes;
-use crate::padding::Padding;
+use crate::error::{DenoiseError, check_sizes};
+use crate::padding::{Padding, PixelRange};
 use crate::tiles::Tiles;
 
 /// The exposure that alpha is scaled to for the network. On one image of Cycles, 0.05 gave a third of
@@ -55,9 +55,6 @@ fn varies(plane: &[f32], height: usize, width: usize) -> Vec<bool> {
     };
     pixels.map(differs).collect()
 }
-
-/// Rows or columns of the padded image, in pixels.
-pub(super) type PixelRange = std::ops::Range<usize>;
 
 impl<'a> FrameInput<'a> {
     /// The input of one pass; fails for buffers of the wrong size.
@@ -183,17 +180,15 @@ impl<'a> FrameInput<'a> {
             Head::Kernel => 1.0,
             _ => 0.5,
         };
-        let denoised = alpha
-            .iter()
-            .enumerate()
-            .map(|(i, rendered)| match varies[i] {
-                false => *rendered,
-                true => {
-                    let channels = (0..COLOR_CHANNELS).map(|channel| image[channel * pixels + i]);
-                    let mean = channels.sum::<f32>() / COLOR_CHANNELS as f32;
-                    (1.0 - share) * rendered + share * mean.clamp(0.0, 1.0)
-                }
-            });
+        let denoised = alpha.iter().enumerate().map(|(i, rendered)| {
+            if varies[i] {
+                let channels = (0..COLOR_CHANNELS).map(|channel| image[channel * pixels + i]);
+                let mean = channels.sum::<f32>() / COLOR_CHANNELS as f32;
+                (1.0 - share) * rendered + share * mean.clamp(0.0, 1.0)
+            } else {
+                *rendered
+            }
+        });
         Ok(Some(denoised.collect()))
     }
 
@@ -238,12 +233,11 @@ impl<'a> FrameInput<'a> {
             out.map_err(cancelled)
         };
         let inputs = [color_gamma, features_z];
-        let (out, filtered) = match self.layers.is_empty() {
-            true => {
-                let forward = |inputs| forward(inputs, None).map(|(out, _)| out);
-                (self.ensemble.mean(inputs, forward)?, None)
-            }
-            false => forward(inputs, Some(layers.input(self.padding, &self.device)))?,
+        let (out, filtered) = if self.layers.is_empty() {
+            let forward = |inputs| forward(inputs, None).map(|(out, _)| out);
+            (self.ensemble.mean(inputs, forward)?, None)
+        } else {
+            forward(inputs, Some(layers.input(self.padding, &self.device)))?
         };
         let mut out = self.read(out)?;
         in_pieces(&mut out, modulation.as_deref(), |out, modulation| {
@@ -273,17 +267,14 @@ impl<'a> FrameInput<'a> {
             return (None, Tensor::<4>::zeros([1; 4], &self.device).expand(shape));
         }
         let mut features = self.features(rows, columns);
-        let modulation = match self.demodulate {
-            true if demodulates => {
-                let pixels = rows.len() * columns.len();
-                let mut albedo = features[TEXTURES * pixels..][..COLOR_CHANNELS * pixels].to_vec();
-                in_pieces(&mut albedo, None, |albedo, _| {
-                    meta.normalizer.modulation_from_albedo(albedo);
-                });
-                Some(albedo)
-            }
-            _ => None,
-        };
+        let modulation = (self.demodulate && demodulates).then(|| {
+            let pixels = rows.len() * columns.len();
+            let mut albedo = features[TEXTURES * pixels..][..COLOR_CHANNELS * pixels].to_vec();
+            in_pieces(&mut albedo, None, |albedo, _| {
+                meta.normalizer.modulation_from_albedo(albedo);
+            });
+            albedo
+        });
         meta.normalizer.features_z_from_raw(&mut features);
         let features_z = self.tensor::<FEATURES>(features, rows, columns);
         (modulation, features_z)

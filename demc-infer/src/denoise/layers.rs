@@ -10,11 +10,10 @@ use demc_model::Head;
 use demc_model::config::COLOR_CHANNELS;
 use rayon::prelude::*;
 
-use super::PixelRange;
 use crate::Bundle;
 use crate::ensemble::Ensemble;
 use crate::error::LayersError;
-use crate::padding::Padding;
+use crate::padding::{Padding, PixelRange};
 
 /// The last parts of names, in any case, of channels that the albedo's red, green, and blue belong to.
 const COLORS: [&str; COLOR_CHANNELS] = ["r", "g", "b"];

@@ -9,6 +9,7 @@ mod layers;
 #[cfg(test)]
 mod layers_tests;
 mod light;
+mod progress;
 mod seams;
 #[cfg(test)]
 mod tests;
@@ -25,40 +26,19 @@ use crate::ensemble::Ensemble;
 use crate::padding::Padding;
 use crate::tiles::{Tiles, Tiling};
 use crate::{Bundle, memory};
-use input::{FrameInput, PixelRange};
+use input::FrameInput;
 use layers::{check_layer_sizes, layer_images};
 
 pub use crate::error::{DenoiseError, LayersError};
 pub use demc_data::input::transform::MAX_INPUT_SCALE;
 pub use layers::Layer;
+pub use progress::{DenoiseObserver, DenoiseProgress, unobserved};
 pub use seams::SeamError;
 
 /// Exposures up to this factor outside the training scenes' range are not scaled: a stop, the
 /// exposure augmentation of training. On the data set's scenes, a stop within the range changed the
 /// error by up to 25 % in either direction.
 const TOLERANCE: f64 = 2.0;
-
-/// How far denoising an image has come.
-#[derive(Debug, Clone, Copy, PartialEq)]
-#[non_exhaustive]
-pub struct DenoiseProgress {
-    /// The tile that is computed, from 0.
-    pub tile: usize,
-    /// Number of tiles.
-    pub tiles: usize,
-    /// Finished share of the image, from 0 to 1. It stays at 0 in the pass of an albedo filter and
-    /// at 1 in that of alpha.
-    pub share: f64,
-}
-
-/// Receives the progress, and may stop the work. On the CPU it is called for every band of rows,
-/// elsewhere for every tile.
-pub type DenoiseObserver<'a> = dyn FnMut(DenoiseProgress) -> ControlFlow<()> + 'a;
-
-/// Lets the work finish.
-pub fn unobserved(_: DenoiseProgress) -> ControlFlow<()> {
-    ControlFlow::Continue(())
-}
 
 /// How a frame is denoised.
 #[derive(Debug, Clone, Default)]
@@ -168,9 +148,10 @@ impl Bundle {
         let mut layer_planes = color_hdr.split_off(COLOR_CHANNELS * pixels);
         input.layers = &[];
         let alpha = input.denoise_alpha(&tiles, observer)?;
-        let seam_error = match tiling.is_exact() {
-            true => None,
-            false => input.seam_error(&tiles, &color_hdr, observer)?,
+        let seam_error = if tiling.is_exact() {
+            None
+        } else {
+            input.seam_error(&tiles, &color_hdr, observer)?
         };
         if restore_light.unwrap_or(self.meta.normalizer.restore_light) {
             let factors = light::factors(&frame.color, &color_hdr, frame.height, frame.width);
@@ -209,9 +190,10 @@ impl Bundle {
         };
         let (low, high) = (f64::from(range.low), f64::from(range.high));
         let is_usual = (low / TOLERANCE..=high * TOLERANCE).contains(&exposure);
-        match is_usual {
-            true => 1.0,
-            false => exposure_scale((low * high).sqrt() as f32, exposure),
+        if is_usual {
+            1.0
+        } else {
+            exposure_scale((low * high).sqrt() as f32, exposure)
         }
     }
 

@@ -1,12 +1,14 @@
 //! The error of a halo below the exact one, measured in small windows at seams that are denoised
 //! again with the exact halo.
 
-use crate::padding::Padding;
-use crate::tiles::{EXACT_HALO, Span, Tiles};
 use demc_model::DOWNSAMPLING;
 use demc_model::metrics::rel_mse_image;
 
-use super::{DenoiseError, DenoiseObserver, DenoiseProgress, FrameInput, PixelRange};
+use super::input::FrameInput;
+use super::progress::{DenoiseObserver, DenoiseProgress};
+use crate::error::DenoiseError;
+use crate::padding::{Padding, PixelRange};
+use crate::tiles::{EXACT_HALO, Span, Tiles};
 
 /// Side of a window in pixels, a multiple of 32.
 const WINDOW: usize = 64;

@@ -226,9 +226,10 @@ fn the_observer_can_stop_the_work_at_every_call() {
         let mut calls = 0;
         let done = bundle.denoise_with(&frame, &options, |_| {
             calls += 1;
-            match calls == last {
-                true => ControlFlow::Break(()),
-                false => ControlFlow::Continue(()),
+            if calls == last {
+                ControlFlow::Break(())
+            } else {
+                ControlFlow::Continue(())
             }
         });
         (done, calls)

@@ -4,7 +4,7 @@
 use demc_model::metrics::METRICS;
 use serde::Serialize;
 
-use super::{ImageScore, Report, Score};
+use super::score::{ImageScore, Report, Score};
 use crate::statistics::Estimate;
 
 /// Number of images below which a bootstrap interval is too narrow (Hesterberg 2015). Reports say
@@ -93,7 +93,7 @@ impl Report {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::image;
+    use super::super::score::tests::image;
     use super::*;
 
     fn report(pairs: &[(f64, f64)]) -> Report {

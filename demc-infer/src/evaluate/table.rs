@@ -5,7 +5,7 @@ use std::fmt;
 use demc_model::metrics::{METRICS, Metric};
 use demc_program::message::{list, printable};
 
-use super::{Report, Score, is_headline};
+use super::score::{Report, Score, is_headline};
 
 const NONE: &str = "-";
 
@@ -125,8 +125,8 @@ fn legend(metrics: &[&Metric]) -> String {
 mod tests {
     use demc_model::metrics;
 
-    use super::super::FailedImage;
-    use super::super::tests::image;
+    use super::super::score::FailedImage;
+    use super::super::score::tests::image;
     use super::*;
 
     #[test]

@@ -1,9 +1,8 @@
 //! Compares an image's statistics with the ranges of the training scenes.
 
+use demc_data::check::geometry::Warning;
 use demc_data::image::frame::FEATURE_NAMES;
 use demc_data::{FrameSummary, PositionSpace, Ranges};
-
-use super::Warning;
 
 /// Largest distance of a mean from the training scenes' range, in widths of that range.
 ///

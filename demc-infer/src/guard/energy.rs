@@ -2,9 +2,8 @@
 //! so no reference is needed.
 
 use demc_data::Frame;
+use demc_data::check::geometry::Warning;
 use demc_model::config::COLOR_CHANNELS;
-
-use super::Warning;
 
 /// Smallest bias that causes a warning (ours).
 const MIN_BIAS: f64 = 0.1;

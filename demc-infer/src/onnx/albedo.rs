@@ -8,8 +8,8 @@ use demc_data::input::transform::MAX_ALBEDO;
 use demc_model::config::COLOR_CHANNELS;
 
 use super::graph::{AttributeValue, GraphBuilder, Value};
+use super::network::{COLOR, FEATURES, OUTPUT};
 use super::proto::GraphProto;
-use super::{COLOR, FEATURES, OUTPUT};
 use crate::Precision;
 use crate::bundle::PREFIX;
 

@@ -40,6 +40,8 @@ use proto::{
     TensorShapeProto, TensorTypeProto, TypeProto, ValueInfoProto,
 };
 
+pub use network::{COLOR, FEATURES, OUTPUT};
+
 /// The operator set.
 pub const OPSET: i64 = 17;
 /// The version of the file format released with it (ONNX 1.12).
@@ -49,12 +51,6 @@ const MAX_BYTES: u64 = i32::MAX as u64;
 /// Upper bound for the file's size without weights: names, attributes, texts. Measured: 21 kB.
 const OTHER_BYTES: u64 = 1 << 20;
 
-/// Name of the input with the noisy colour.
-pub const COLOR: &str = "color";
-/// Name of the input with the features.
-pub const FEATURES: &str = "features";
-/// Name of the output.
-pub const OUTPUT: &str = "output";
 /// Metadata key of the bundle's header as JSON: model, normalizer, layout, step, albedo filter.
 pub const META: &str = "demc";
 /// Metadata key of [`FEATURE_NAMES`] as JSON.

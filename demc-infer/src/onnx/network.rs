@@ -17,9 +17,14 @@ use demc_model::layers::ConvBlock;
 use demc_model::{Denoiser, Role, WeightSpec};
 
 use super::graph::{AttributeValue, GraphBuilder, Value};
-use super::{COLOR, FEATURES, OUTPUT};
 use crate::Precision;
 
+/// Name of the input with the noisy colour.
+pub const COLOR: &str = "color";
+/// Name of the input with the features.
+pub const FEATURES: &str = "features";
+/// Name of the output.
+pub const OUTPUT: &str = "output";
 impl GraphBuilder {
     pub(super) fn denoise(&mut self, model: &Denoiser, normalizer: &Normalizer) {
         let features = self.albedo_clamped();
@@ -160,9 +165,10 @@ impl GraphBuilder {
         let parts: Vec<&Value> = std::iter::once(&decoded).chain(&skips).collect();
         let all = self.concat(&format!("{}.concat", decoded.0), &parts);
         let fused = self.conv(&all, &level.fuse, None);
-        match level.activated_fusion {
-            true => self.relu(&fused),
-            false => fused,
+        if level.activated_fusion {
+            self.relu(&fused)
+        } else {
+            fused
         }
     }
 

@@ -53,9 +53,10 @@ impl Pixels {
     }
 
     fn color(&self) -> ColorType {
-        match self.values.len() == self.width * self.height {
-            true => ColorType::Luma,
-            false => ColorType::Rgb,
+        if self.values.len() == self.width * self.height {
+            ColorType::Luma
+        } else {
+            ColorType::Rgb
         }
     }
 

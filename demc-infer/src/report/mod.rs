@@ -12,12 +12,8 @@ use demc_model::metrics::METRICS;
 use serde::Serialize;
 use serde_json::json;
 
-use crate::denoise::DenoiseError;
 use crate::evaluate::{FEW_IMAGES, ImageScore, Report};
-pub use views::{EncodedScene, SceneImages};
-
-/// Bytes of all pictures before base64, which adds a third. The page stays below 20 MB.
-const BUDGET: usize = 14_000_000;
+pub use views::{EncodedScene, ReportError, SceneImages};
 
 const TEMPLATE: &str = include_str!("page.html");
 const STYLE: &str = include_str!("style.css");
@@ -27,26 +23,6 @@ const SCRIPTS: [&str; 4] = [
     include_str!("tables.js"),
     include_str!("charts.js"),
 ];
-
-/// Why a report cannot be made.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum ReportError {
-    /// A picture cannot be encoded.
-    #[error("{name}: its pictures cannot be encoded")]
-    Encoding {
-        /// The image.
-        name: String,
-        /// The encoder's error.
-        source: jpeg_encoder::EncodingError,
-    },
-    /// The reference is missing, or an image cannot be compared with it.
-    #[error(transparent)]
-    Images(#[from] DenoiseError),
-    /// The numbers cannot be written as JSON.
-    #[error("cannot encode the report's JSON")]
-    Json(#[from] serde_json::Error),
-}
 
 /// The subject of a report.
 #[derive(Debug, Clone, Serialize)]

@@ -9,9 +9,31 @@ use serde::Serialize;
 
 use super::codec::{Jpeg, Pixels, reduced};
 use super::error_map::{ErrorMap, ErrorPatch};
-use super::{BUDGET, ReportError};
 use crate::denoise::DenoiseError;
 use crate::evaluate::{image_of, reference_of};
+
+/// Bytes of all pictures before base64, which adds a third. The page stays below 20 MB.
+const BUDGET: usize = 14_000_000;
+
+/// Why a report cannot be made.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ReportError {
+    /// A picture cannot be encoded.
+    #[error("{name}: its pictures cannot be encoded")]
+    Encoding {
+        /// The image.
+        name: String,
+        /// The encoder's error.
+        source: jpeg_encoder::EncodingError,
+    },
+    /// The reference is missing, or an image cannot be compared with it.
+    #[error(transparent)]
+    Images(#[from] DenoiseError),
+    /// The numbers cannot be written as JSON.
+    #[error("cannot encode the report's JSON")]
+    Json(#[from] serde_json::Error),
+}
 
 /// JPEG quality of the patches, which are shown enlarged.
 const PATCH_QUALITY: u8 = 95;

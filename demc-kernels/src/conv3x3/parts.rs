@@ -15,21 +15,22 @@ pub(super) struct Axes {
 impl Axes {
     /// For the convolution, or (`transposed`) for its gradient with respect to the input.
     pub(super) fn new(outputs: usize, inputs: usize, transposed: bool) -> Self {
-        match transposed {
-            false => Axes {
-                inputs,
-                outputs,
-                input_step: 9,
-                output_step: 9 * inputs,
-                flipped: false,
-            },
-            true => Axes {
+        if transposed {
+            Axes {
                 inputs: outputs,
                 outputs: inputs,
                 input_step: 9 * inputs,
                 output_step: 9,
                 flipped: true,
-            },
+            }
+        } else {
+            Axes {
+                inputs,
+                outputs,
+                input_step: 9,
+                output_step: 9 * inputs,
+                flipped: false,
+            }
         }
     }
 

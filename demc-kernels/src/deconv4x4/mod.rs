@@ -21,10 +21,7 @@ use crate::rows::{self, Copy, Outer, Packed, Term, copy, whole};
 use crate::scratch::{Scratch, Shared};
 use crate::{Grid, Isa};
 use cells::Cells;
-use weights::packed;
-
-/// Offsets of the 2x2 inputs of a cell.
-const TAPS: [(usize, usize); 4] = [(0, 0), (0, 1), (1, 0), (1, 1)];
+use weights::{TAPS, packed};
 
 /// `y = x * weight + bias`, rectified if `relu`.
 ///

@@ -4,12 +4,14 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::TAPS;
 use crate::Isa;
 use crate::product::Panels;
 use crate::rows::Packed;
 use crate::scratch::Shared;
 use crate::simd::{Leaf, Simd, WIDEST, run};
+
+/// Offsets of the 2x2 inputs of a cell.
+pub(super) const TAPS: [(usize, usize); 4] = [(0, 0), (0, 1), (1, 0), (1, 1)];
 
 /// Packs a weight `[in, out, 4, 4]` by taps. Each task packs the rows of some inputs of `in x 4
 /// out` matrices, or (transposed) the rows of some outputs of `4 out x in` matrices.
@@ -34,9 +36,10 @@ impl Leaf for PackTaps<'_> {
             transposed,
             ..
         } = self;
-        let (depth, columns, lanes_of) = match transposed {
-            false => (inputs, 4 * outputs, outputs),
-            true => (4 * outputs, inputs, inputs),
+        let (depth, columns, lanes_of) = if transposed {
+            (4 * outputs, inputs, inputs)
+        } else {
+            (inputs, 4 * outputs, outputs)
         };
         let panels = Panels::new::<S>(columns);
         // Adjacent outputs in the file are read together, one cache line each.
@@ -92,9 +95,10 @@ pub(super) fn packed(
     outputs: usize,
     transposed: bool,
 ) -> [Packed; 4] {
-    let (depth, columns, count) = match transposed {
-        false => (inputs, 4 * outputs, inputs),
-        true => (4 * outputs, inputs, outputs),
+    let (depth, columns, count) = if transposed {
+        (4 * outputs, inputs, outputs)
+    } else {
+        (inputs, 4 * outputs, inputs)
     };
     let mut packed = TAPS.map(|_| Packed::empty(depth, columns));
     let [a, b, c, d] = &mut packed;

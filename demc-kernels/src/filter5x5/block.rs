@@ -2,10 +2,18 @@
 
 use std::ops::Range;
 
-use super::{COLORS, REACH, TAPS};
 use crate::Grid;
 use crate::power::{exp, sigmoid};
 use crate::scratch::Scratch;
+
+/// Channels of the filtered image.
+pub const COLORS: usize = 3;
+/// Side of a kernel, in pixels.
+pub(super) const SIDE: usize = 5;
+/// Pixels on each side of the centre.
+pub(super) const REACH: usize = SIDE / 2;
+/// Weights of a kernel.
+pub const TAPS: usize = SIDE * SIDE;
 
 /// Pixels of a row that are computed together, one per lane.
 pub(super) const BLOCK: usize = 16;

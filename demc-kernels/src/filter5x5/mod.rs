@@ -12,16 +12,9 @@ use std::ops::Range;
 use crate::simd::{self, Leaf, Simd};
 use crate::tasks;
 use crate::{Grid, Isa};
-use block::{BLOCK, PaddedRows, blends_of, kernels_of};
+use block::{BLOCK, PaddedRows, SIDE, blends_of, kernels_of};
 
-/// Channels of the filtered image.
-pub const COLORS: usize = 3;
-/// Side of a kernel, in pixels.
-const SIDE: usize = 5;
-/// Pixels on each side of the centre.
-const REACH: usize = SIDE / 2;
-/// Weights of a kernel.
-pub const TAPS: usize = SIDE * SIDE;
+pub use block::{COLORS, TAPS};
 
 /// Filters each pixel with its own 5x5 kernel: the softmax of its first 25 logits. The image's
 /// border is replicated. A 26th logit becomes a fourth channel, its sigmoid.

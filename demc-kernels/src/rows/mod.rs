@@ -17,15 +17,10 @@ use crate::simd::{Leaf, Simd, run};
 
 use copy::finish;
 pub(crate) use copy::{Copy, column_sums, copy};
-pub(crate) use outer::{Outer, PaddedRows, add_outer, outer};
+pub(crate) use outer::{Outer, PaddedRows, add_outer, outer, whole};
 
 /// Maximum number of rows of a product that are computed at once.
 pub(crate) const BLOCK: usize = 96;
-
-/// Columns rounded up to whole vectors of every path.
-pub(crate) fn whole(columns: usize) -> usize {
-    columns.next_multiple_of(16)
-}
 
 /// A weight `[depth, columns]`, packed for the products of one path.
 pub(crate) struct Packed {

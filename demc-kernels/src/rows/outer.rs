@@ -2,11 +2,15 @@
 
 use rayon::prelude::*;
 
-use super::whole;
 use crate::Isa;
 use crate::product::{Left, ROW_BLOCK, Right, padded_rows, product};
 use crate::scratch::{Scratch, Shared};
 use crate::simd::{Leaf, Simd, run};
+
+/// Columns rounded up to whole vectors of every path.
+pub(crate) fn whole(columns: usize) -> usize {
+    columns.next_multiple_of(16)
+}
 
 /// One gradient of a weight: the sum over pixels of a row of `a` times a row of `b`.
 #[derive(Clone, Copy)]

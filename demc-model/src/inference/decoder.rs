@@ -8,8 +8,10 @@ use demc_kernels::deconv4x4::PreparedDeconvolution;
 use demc_kernels::{Grid, Isa, memory};
 
 use super::band::bands;
+use super::feature_maps::FeatureMaps;
 use super::folded::FoldedConv;
-use super::{Cancelled, FeatureMaps, InferencePass};
+use super::pass::InferencePass;
+use super::watch::Cancelled;
 use crate::decoder::DecoderLevel;
 
 impl InferencePass<'_> {

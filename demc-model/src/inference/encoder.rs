@@ -7,9 +7,11 @@ use demc_kernels::conv3x3::PreparedConvolution;
 use demc_kernels::{Grid, pool};
 
 use super::band::{BandedConv, ConvChain, RowWindow, bands};
+use super::feature_maps::FeatureMaps;
 use super::folded::FoldedConv;
 use super::images::InputImages;
-use super::{Cancelled, FeatureMaps, InferencePass};
+use super::pass::InferencePass;
+use super::watch::Cancelled;
 use crate::config::{Input, LEVELS};
 use crate::encoder::EncoderLevel;
 use crate::fusion::Fusion;

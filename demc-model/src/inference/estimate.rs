@@ -2,9 +2,9 @@
 
 use demc_kernels::{Grid, memory};
 
-use super::BandPlan;
 use super::encoder::DEEPEST_BANDED;
 use super::full_resolution::UPPER_LEVELS;
+use super::pass::BandPlan;
 use crate::config::{
     COLOR_CHANNELS, DETAIL_CHANNELS, FEATURE_CHANNELS, Head, Input, LEVELS, ModelConfig,
     channels_of,
@@ -126,9 +126,10 @@ impl PeakEstimate<'_> {
     }
 
     fn images(&self) -> usize {
-        let features = match self.config.variant.spec().takes_features() {
-            true => FEATURE_CHANNELS,
-            false => 0,
+        let features = if self.config.variant.spec().takes_features() {
+            FEATURE_CHANNELS
+        } else {
+            0
         };
         self.grid.pixels() * (COLOR_CHANNELS + features)
     }
@@ -138,9 +139,10 @@ impl PeakEstimate<'_> {
     }
 
     fn detail(&self) -> usize {
-        match self.has_fusion() {
-            true => self.grid.pixels() * DETAIL_CHANNELS,
-            false => 0,
+        if self.has_fusion() {
+            self.grid.pixels() * DETAIL_CHANNELS
+        } else {
+            0
         }
     }
 
@@ -161,9 +163,10 @@ impl PeakEstimate<'_> {
 
     /// The colour that a kernel head needs after the encoders; a large image's is kept anyway.
     fn kept_color(&self) -> usize {
-        match self.config.head == Head::Kernel && !self.plan.is_banded(self.grid) {
-            true => self.grid.pixels() * COLOR_CHANNELS,
-            false => 0,
+        if self.config.head == Head::Kernel && !self.plan.is_banded(self.grid) {
+            self.grid.pixels() * COLOR_CHANNELS
+        } else {
+            0
         }
     }
 
@@ -189,9 +192,10 @@ impl PeakEstimate<'_> {
     fn scratch(&self, inputs: usize, outputs: usize, pixels: usize) -> usize {
         let tiles = (pixels / TILE_PIXELS).min(self.plan.threads * TILES);
         // Narrow convolutions need less than a cache.
-        match inputs * outputs * TILE_VALUES > 512 << 10 {
-            true => TILE_VALUES * (inputs + outputs) * tiles,
-            false => 0,
+        if inputs * outputs * TILE_VALUES > 512 << 10 {
+            TILE_VALUES * (inputs + outputs) * tiles
+        } else {
+            0
         }
     }
 
@@ -267,9 +271,10 @@ impl PeakEstimate<'_> {
             let grid = self.grid_of(level);
             let below = self.below(level);
             let weights = 16 * self.config.channels_below(level) * self.channels(level);
-            let share = match self.plan.is_banded(grid) {
-                true => self.plan.band as f64 / grid.height as f64,
-                false => 1.0,
+            let share = if self.plan.is_banded(grid) {
+                self.plan.band as f64 / grid.height as f64
+            } else {
+                1.0
             };
             // The decoded rows, and the rows of the level below with their border.
             let working = (share * (self.map(level) + below) as f64) as usize;

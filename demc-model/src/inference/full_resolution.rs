@@ -13,10 +13,12 @@ use demc_kernels::{Grid, memory};
 use super::band::{ConvChain, RowWindow, bands};
 use super::decoder::folded_level;
 use super::encoder::{BandedLevel, folded_block};
+use super::feature_maps::FeatureMaps;
 use super::folded::FoldedConv;
 use super::images::InputImages;
 use super::kernel_head::KernelHead;
-use super::{Cancelled, FeatureMaps, InferencePass};
+use super::pass::InferencePass;
+use super::watch::Cancelled;
 use crate::config::{COLOR_CHANNELS, DETAIL_CHANNELS, Input};
 
 /// Number of levels that each band passes in one go. Their prepared weights are in memory together;

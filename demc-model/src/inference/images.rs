@@ -8,7 +8,7 @@ use burn::tensor::Tensor;
 use demc_kernels::Grid;
 use rayon::prelude::*;
 
-use super::FeatureMaps;
+use super::feature_maps::FeatureMaps;
 use crate::config::{DETAIL_CHANNELS, Input, channels_of};
 
 /// The images to denoise: planes of gamma-compressed colour, and of Z-scored features while they

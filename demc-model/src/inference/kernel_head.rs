@@ -10,9 +10,10 @@ use demc_kernels::{Grid, Isa, blend, filter5x5, grid, memory, power};
 use rayon::prelude::*;
 
 use super::band::bands;
+use super::feature_maps::FeatureMaps;
 use super::folded::FoldedConv;
 use super::images::host;
-use super::{FeatureMaps, InferencePass};
+use super::pass::InferencePass;
 use crate::config::COLOR_CHANNELS;
 use crate::denoiser::Denoiser;
 use crate::kernel_head::{DARKEST, GAMMA, KERNEL_LEVELS};

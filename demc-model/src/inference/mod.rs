@@ -18,46 +18,37 @@ mod band;
 mod decoder;
 mod encoder;
 mod estimate;
+mod feature_maps;
 mod folded;
 mod full_resolution;
 mod images;
 mod kernel_head;
+mod pass;
 #[cfg(test)]
 mod tests;
 mod watch;
-
-use std::ops::Range;
 
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use burn::nn::conv::Conv2d;
 use burn::tensor::{Tensor, TensorData};
-use demc_kernels::conv3x3::{PreparedConvolution, Tile};
-use demc_kernels::{Grid, Isa, grid, memory};
+use demc_kernels::conv3x3::Tile;
+use demc_kernels::{Isa, grid, memory};
 
 use crate::config::{COLOR_CHANNELS, LEVELS};
 use crate::decoder::Decoder;
 use crate::denoiser::Denoiser;
-use band::TILE_ROWS;
 use encoder::{DEEPEST_BANDED, folded_block};
+use feature_maps::FeatureMaps;
 use full_resolution::{SkipSources, UPPER_LEVELS};
 use images::InputImages;
 use kernel_head::KernelHead;
+use pass::{BandPlan, InferencePass};
 use watch::Watch;
 
 pub use estimate::{pass_bytes, peak_bytes, reusable_bytes};
 pub use folded::{FoldedConv, norm_scale};
 pub use watch::{Cancelled, Observer};
-
-/// Pixels of the full resolution in a band, per thread: enough work for a thread, little enough for
-/// caches.
-const BAND_PIXELS: usize = 20 << 10;
-
-/// Largest number of rows of a band, so that a large image is computed in bands on every machine.
-const MOST_ROWS: usize = 256;
-
-/// The rows of a band are a multiple of this: of a tile, at the level below, too.
-const BAND_STEP: usize = 2 * TILE_ROWS;
 
 pub(crate) fn forward(
     model: &Denoiser,
@@ -113,39 +104,6 @@ fn forward_with(
     Ok((tensor(out, batch), layers))
 }
 
-#[derive(Clone, Copy)]
-struct BandPlan {
-    /// Rows of a band at every level. With the paper's levels, where channels double and the width
-    /// halves, a row has the same number of values at every level.
-    band: usize,
-    threads: usize,
-}
-
-impl BandPlan {
-    /// The plan for images of this width with the current number of threads.
-    fn new(width: usize) -> Self {
-        let threads = rayon::current_num_threads();
-        let rows = BAND_PIXELS * threads / width;
-        BandPlan {
-            band: rows.clamp(1, MOST_ROWS).next_multiple_of(BAND_STEP),
-            threads,
-        }
-    }
-
-    /// Whether maps on `grid` are computed in bands: two bands or fewer save nothing.
-    fn is_banded(self, grid: Grid) -> bool {
-        grid.height > 2 * self.band
-    }
-}
-
-struct InferencePass<'a> {
-    isa: Isa,
-    tile: Tile,
-    plan: BandPlan,
-    model: &'a Denoiser,
-    watch: &'a Watch<'a, 'a>,
-}
-
 struct EncodedImages {
     /// The skips' share of each level's fusion, from the full resolution down; without the first
     /// level if `sources` holds its inputs.
@@ -159,21 +117,21 @@ struct EncodedImages {
 impl InferencePass<'_> {
     fn encode(&self, images: InputImages) -> Result<EncodedImages, Cancelled> {
         let (mut sums, mut sources) = (Vec::with_capacity(LEVELS), None);
-        let (first, mut inputs) = match self.plan.is_banded(images.grid) {
-            true => {
-                let upper = self.encode_upper_levels(images)?;
-                sums.push(upper.sum);
-                sources = Some(upper.sources);
-                (UPPER_LEVELS, upper.below)
-            }
-            false => (0, self.encoder_inputs(images)),
+        let (first, mut inputs) = if self.plan.is_banded(images.grid) {
+            let upper = self.encode_upper_levels(images)?;
+            sums.push(upper.sum);
+            sources = Some(upper.sources);
+            (UPPER_LEVELS, upper.below)
+        } else {
+            (0, self.encoder_inputs(images))
         };
         for level in first..LEVELS {
             let grid = inputs[0].grid;
             let banded = level <= DEEPEST_BANDED && self.plan.is_banded(grid);
-            sums.push(match banded {
-                true => self.encode_level_in_bands(level, &mut inputs)?,
-                false => self.encode_level(level, &mut inputs)?,
+            sums.push(if banded {
+                self.encode_level_in_bands(level, &mut inputs)?
+            } else {
+                self.encode_level(level, &mut inputs)?
             });
         }
         let bottom = inputs.pop().expect("the last encoder feeds the latent");
@@ -216,87 +174,10 @@ impl InferencePass<'_> {
             }
         }
     }
-
-    /// A convolution of whole maps with a ReLU.
-    fn conv3x3(&self, x: &FeatureMaps, conv: &FoldedConv) -> FeatureMaps {
-        let mut y = FeatureMaps::new(x.grid, conv.outputs());
-        let (weight, bias) = (conv.weight(), conv.bias());
-        let prepared = PreparedConvolution::new(self.isa, self.tile, weight, bias, true);
-        prepared.forward(x.grid, &x.values, 0, &mut y.values);
-        y
-    }
 }
 
 /// The output convolution of a network without a kernel head.
 fn conv_head(decoder: &Decoder) -> &Conv2d {
     let head = decoder.head.as_ref();
     head.expect("a head is a convolution or kernels")
-}
-
-struct FeatureMaps {
-    grid: Grid,
-    values: Vec<f32>,
-}
-
-impl FeatureMaps {
-    /// Maps to be written; their initial values are arbitrary.
-    fn new(grid: Grid, channels: usize) -> Self {
-        FeatureMaps {
-            grid,
-            values: memory::buffer(grid.pixels() * channels),
-        }
-    }
-
-    fn channels(&self) -> usize {
-        self.values.len() / self.grid.pixels()
-    }
-
-    /// The grid of `rows` rows of one image.
-    fn band(&self, rows: usize) -> Grid {
-        Grid {
-            batch: 1,
-            height: rows,
-            ..self.grid
-        }
-    }
-
-    fn rows(&self, image: usize, rows: Range<usize>) -> &[f32] {
-        &self.values[self.range(image, rows)]
-    }
-
-    fn rows_mut(&mut self, image: usize, rows: Range<usize>) -> &mut [f32] {
-        let range = self.range(image, rows);
-        &mut self.values[range]
-    }
-
-    /// All rows of some images.
-    fn images(&self, images: Range<usize>) -> &[f32] {
-        let image = self.grid.height * self.grid.width * self.channels();
-        &self.values[images.start * image..images.end * image]
-    }
-
-    /// The same rows of each of some images.
-    fn rows_of_images_mut(&mut self, images: Range<usize>, rows: Range<usize>) -> Vec<&mut [f32]> {
-        let row = self.grid.width * self.channels();
-        let all = self.values.chunks_mut(self.grid.height * row);
-        all.skip(images.start)
-            .take(images.len())
-            .map(|values| &mut values[rows.start * row..rows.end * row])
-            .collect()
-    }
-
-    fn range(&self, image: usize, rows: Range<usize>) -> Range<usize> {
-        let row = self.grid.width * self.channels();
-        let first = image * self.grid.height;
-        (first + rows.start) * row..(first + rows.end) * row
-    }
-
-    /// The rows with one more on each side, inside the map, and the number of rows added above.
-    fn with_neighbours(&self, rows: Range<usize>) -> (Range<usize>, usize) {
-        let start = rows.start.saturating_sub(1);
-        (
-            start..(rows.end + 1).min(self.grid.height),
-            rows.start - start,
-        )
-    }
 }

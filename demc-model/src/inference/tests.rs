@@ -7,7 +7,8 @@ use demc_kernels::conv3x3::Tile;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{BandPlan, forward_with};
+use super::forward_with;
+use super::pass::BandPlan;
 use crate::{Denoiser, Head, ModelConfig, Ops, Reading, Variant};
 
 /// More rows than any image here, so no bands.
@@ -194,9 +195,10 @@ fn every_call_of_the_observer_can_cancel() {
         let mut calls = 0;
         let mut observer = |_| {
             calls += 1;
-            match calls == stop {
-                true => ControlFlow::Break(()),
-                false => ControlFlow::Continue(()),
+            if calls == stop {
+                ControlFlow::Break(())
+            } else {
+                ControlFlow::Continue(())
             }
         };
         let size = [1, 96, 64];

@@ -4,8 +4,10 @@ use std::sync::OnceLock;
 
 use rayon::prelude::*;
 
-use super::DISPLAY_GAMMA;
-use super::flip::Appearance;
+use super::appearance::Appearance;
+
+/// Gamma of the tone mapping for SSIM and pictures (Eq. 4).
+pub const DISPLAY_GAMMA: f32 = 2.2;
 
 /// The reason that an image has no metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]

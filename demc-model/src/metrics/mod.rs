@@ -7,6 +7,7 @@
 //!
 //! An image with NaN or infinite values has no metrics: [`Image::new`] counts and refuses them.
 
+mod appearance;
 mod color;
 mod filter;
 mod flip;
@@ -14,21 +15,15 @@ mod image;
 mod perceptual;
 mod relative;
 
-pub use self::image::{Image, ImageError};
+pub use self::image::{DISPLAY_GAMMA, Image, ImageError};
 pub(crate) use perceptual::gaussian;
 pub use perceptual::{SSIM_WINDOW, psnr, ssim};
 pub use relative::{
-    energy_bias, mrse_pbrt, rel_mse, rel_mse_afgsa, rel_mse_image, rel_mse_map, rel_mse_sbmc,
-    rel_mse_trimmed, smape,
+    LOSS_EPSILON, energy_bias, mrse_pbrt, rel_mse, rel_mse_afgsa, rel_mse_image, rel_mse_map,
+    rel_mse_sbmc, rel_mse_trimmed, smape,
 };
 
 pub use flip::flip;
-
-/// Epsilon of Eq. 5.
-pub const LOSS_EPSILON: f32 = 0.001;
-
-/// Gamma of the tone mapping for SSIM and pictures (Eq. 4).
-pub const DISPLAY_GAMMA: f32 = 2.2;
 
 /// A row of the table of metrics.
 #[derive(Debug, Clone, Copy)]

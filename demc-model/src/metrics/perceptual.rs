@@ -3,8 +3,8 @@
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-use super::Image;
 use super::filter::add;
+use super::image::Image;
 
 /// Side of SSIM's Gaussian window in pixels.
 pub const SSIM_WINDOW: usize = 11;

@@ -1,6 +1,9 @@
 //! Errors relative to the reference's own value, in linear HDR and float64.
 
-use super::{Image, LOSS_EPSILON};
+use super::image::Image;
+
+/// Epsilon of Eq. 5.
+pub const LOSS_EPSILON: f32 = 0.001;
 
 /// Number of pixels at each edge that `relmse@sbmc` leaves out, as SBMC's evaluation does.
 const SBMC_BORDER: usize = 21;

@@ -27,12 +27,11 @@ pub(super) fn filter5x5(x: Tensor<4>, logits: Tensor<4>) -> Tensor<4> {
         image.narrow(3, tap % SIDE, width) * kernels.clone().narrow(1, tap, 1)
     };
     let filtered = (1..taps).fold(tap(0), |sum, i| sum + tap(i));
-    match channels > taps {
-        true => {
-            let weight = activation::sigmoid(logits.narrow(1, taps, 1));
-            Tensor::cat(vec![filtered, weight.expand([batch, 1, height, width])], 1)
-        }
-        false => filtered,
+    if channels > taps {
+        let weight = activation::sigmoid(logits.narrow(1, taps, 1));
+        Tensor::cat(vec![filtered, weight.expand([batch, 1, height, width])], 1)
+    } else {
+        filtered
     }
 }
 

@@ -3,31 +3,11 @@
 use burn::module::RunningState;
 use burn::nn::BatchNorm;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
-use burn::tensor::{Tensor, activation, module::max_pool2d, ops::MaxPoolOptions};
+use burn::tensor::{Tensor, module::max_pool2d, ops::MaxPoolOptions};
 
-use super::{Ops, filter, kernels};
-
-/// The activation after an operation.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Activation {
-    /// The identity.
-    None,
-    /// `max(x, 0)`, fused into the operation by the kernels.
-    Relu,
-}
-
-impl Activation {
-    pub(super) fn is_relu(self) -> bool {
-        self == Activation::Relu
-    }
-
-    fn apply(self, x: Tensor<4>) -> Tensor<4> {
-        match self {
-            Activation::None => x,
-            Activation::Relu => activation::relu(x),
-        }
-    }
-}
+use super::activation::Activation;
+use super::choice::Ops;
+use super::{filter, kernels};
 
 /// A batch of feature maps, `[B, C, H, W]` in the paper's terms.
 ///

@@ -228,12 +228,11 @@ mod tests {
         let whole = 0.2 * (columns * share).sqrt() * lr;
         for (i, (moved, grad)) in stepped.iter().zip(&grad).enumerate() {
             let moved = -f64::from(*moved) / whole;
-            match *grad == 0.0 {
-                true => assert!(moved.abs() < 1e-5, "{role:?} {i}: {moved}"),
-                false => {
-                    let moved = moved * f64::from(grad.signum());
-                    assert!((0.6..1.2).contains(&moved), "{role:?} {i}: {moved}");
-                }
+            if *grad == 0.0 {
+                assert!(moved.abs() < 1e-5, "{role:?} {i}: {moved}")
+            } else {
+                let moved = moved * f64::from(grad.signum());
+                assert!((0.6..1.2).contains(&moved), "{role:?} {i}: {moved}");
             }
         }
     }

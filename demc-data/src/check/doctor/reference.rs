@@ -120,9 +120,10 @@ fn other_exposure([noisy, clean]: &[Vec<f64>; 2]) -> Option<Mistake> {
         (
             "the reference has another exposure than the noisy image",
             "render both with one exposure, or divide by it",
-            match stops > 0.0 {
-                true => format!("{stops:.1} stops brighter"),
-                false => format!("{:.1} stops darker", -stops),
+            if stops > 0.0 {
+                format!("{stops:.1} stops brighter")
+            } else {
+                format!("{:.1} stops darker", -stops)
             },
         )
     })
@@ -211,9 +212,10 @@ fn noise(noisy: &Details, clean: &Details) -> Option<Mistake> {
         (
             "the reference is about as noisy as the noisy image",
             "too few samples per pixel, or noisy image and reference swapped",
-            match noisy > 0.0 {
-                true => format!("{:.0} % of its noise variance", 100.0 * clean / noisy),
-                false => "the noisy image has no noise of its own".to_owned(),
+            if noisy > 0.0 {
+                format!("{:.0} % of its noise variance", 100.0 * clean / noisy)
+            } else {
+                "the noisy image has no noise of its own".to_owned()
             },
         )
     })

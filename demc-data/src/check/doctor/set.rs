@@ -40,9 +40,10 @@ impl Image {
         }
         Self {
             exposure,
-            small: match exposure > 0.0 && frame.width.min(frame.height) >= SIDE {
-                true => small(image, frame, DARK * exposure),
-                false => Vec::new(),
+            small: if exposure > 0.0 && frame.width.min(frame.height) >= SIDE {
+                small(image, frame, DARK * exposure)
+            } else {
+                Vec::new()
             },
             hash: hasher.finish(),
         }
@@ -170,8 +171,9 @@ fn duplicates(images: &[(&Scene, Image)]) -> Vec<Finding> {
 }
 
 fn correlation_of(a: &Image, b: &Image) -> Option<f64> {
-    match a.small.len() == b.small.len() {
-        true => correlation(&a.small, &b.small),
-        false => None,
+    if a.small.len() == b.small.len() {
+        correlation(&a.small, &b.small)
+    } else {
+        None
     }
 }

@@ -189,9 +189,10 @@ impl<R: Read + Seek> BlockReader<R> {
         let (tile, level) = (place.tile_index, place.level_index);
         let mut expected = Vec::with_capacity(5);
         expected.extend(several.then_some(part as i64));
-        match tiled {
-            true => expected.extend([tile.0, tile.1, level.0, level.1].map(|index| index as i64)),
-            false => expected.push(i64::from(top)),
+        if tiled {
+            expected.extend([tile.0, tile.1, level.0, level.1].map(|index| index as i64))
+        } else {
+            expected.push(i64::from(top))
         }
         for number in expected {
             if i64::from(integer(&mut self.reader)?) != number {
@@ -223,15 +224,16 @@ impl<R: Read + Seek> BlockReader<R> {
             .read_to_end(&mut compressed_pixels_le)?;
         Ok(Chunk {
             layer_index: part,
-            compressed_block: match tiled {
-                true => CompressedBlock::Tile(CompressedTileBlock {
+            compressed_block: if tiled {
+                CompressedBlock::Tile(CompressedTileBlock {
                     coordinates: place,
                     compressed_pixels_le,
-                }),
-                false => CompressedBlock::ScanLine(CompressedScanLineBlock {
+                })
+            } else {
+                CompressedBlock::ScanLine(CompressedScanLineBlock {
                     y_coordinate: top,
                     compressed_pixels_le,
-                }),
+                })
             },
         })
     }

@@ -90,12 +90,13 @@ impl SampleSpan {
 /// Checks that this many bytes can encode this many pixels.
 pub(super) fn check_density(header: &Header, pixels: usize, bytes: u64) -> Result<(), ExrError> {
     let decoded = pixels as u64 * header.channels.bytes_per_pixel as u64;
-    match decoded <= bytes.saturating_mul(densest(header.compression)) {
-        true => Ok(()),
-        false => Err(invalid(format!(
+    if decoded <= bytes.saturating_mul(densest(header.compression)) {
+        Ok(())
+    } else {
+        Err(invalid(format!(
             "{bytes} bytes with {} cannot hold {decoded} bytes of pixels",
             header.compression
-        ))),
+        )))
     }
 }
 

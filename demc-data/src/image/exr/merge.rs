@@ -123,9 +123,10 @@ fn columns<R: Read + Seek>(inputs: &[MergeInput<R>]) -> Result<Vec<Column>, Erro
             }
         }));
     }
-    match columns.is_empty() {
-        true => Err(Error::Merge("no files".to_owned())),
-        false => Ok(columns),
+    if columns.is_empty() {
+        Err(Error::Merge("no files".to_owned()))
+    } else {
+        Ok(columns)
     }
 }
 

@@ -190,9 +190,10 @@ pub(crate) fn gradient(
     for o in 0..outputs {
         for i in 0..inputs {
             for tap in 0..9 {
-                dweight[(o * inputs + i) * 9 + tap] = match by_output {
-                    true => total(i, tap * outputs + o),
-                    false => total(tap * inputs + i, o),
+                dweight[(o * inputs + i) * 9 + tap] = if by_output {
+                    total(i, tap * outputs + o)
+                } else {
+                    total(tap * inputs + i, o)
                 };
             }
         }

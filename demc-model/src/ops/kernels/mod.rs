@@ -14,7 +14,7 @@ use burn::nn::BatchNorm;
 use burn::tensor::{Tensor, TensorData};
 use demc_kernels::Grid;
 
-use super::Activation;
+use super::activation::Activation;
 
 #[backend_extension(Flex, Autodiff)]
 pub(super) trait KernelOps: Backend {

@@ -1,0 +1,73 @@
+//! Everything about a network except its weights.
+
+use demc_data::{ChannelLayout, Normalizer, PositionSpace, Ranges};
+use demc_model::{ModelConfig, Variant};
+use serde::{Deserialize, Serialize};
+
+/// The bundle format that this build writes and reads. It increases when a tensor's name or meaning
+/// changes.
+pub const FORMAT: u32 = 1;
+
+/// Everything about a network except its weights.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct BundleMeta {
+    /// Bundle format, [`FORMAT`].
+    pub format: u32,
+    /// Variant, reading and width.
+    pub model: ModelConfig,
+    /// Gamma and the training set's statistics.
+    pub normalizer: Normalizer,
+    /// Which channels of a renderer's files hold the 15 planes.
+    pub layout: ChannelLayout,
+    /// Number of optimizer steps behind the weights.
+    pub step: u64,
+    /// Ranges of the training scenes' statistics, which [`guard`](crate::guard) uses; `None` if
+    /// unknown.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ranges: Option<Ranges>,
+}
+
+impl BundleMeta {
+    /// Metadata in the current [`FORMAT`].
+    pub fn new(
+        model: ModelConfig,
+        normalizer: Normalizer,
+        layout: ChannelLayout,
+        step: u64,
+    ) -> Self {
+        Self {
+            format: FORMAT,
+            model,
+            normalizer,
+            layout,
+            step,
+            ranges: None,
+        }
+    }
+
+    /// Adds the ranges of the training scenes' statistics.
+    pub fn with_ranges(self, ranges: Ranges) -> Self {
+        Self {
+            ranges: Some(ranges),
+            ..self
+        }
+    }
+
+    /// Why this network cannot be the albedo filter of one that takes such positions; `None` if it
+    /// can. Both get the same positions: in ONNX and Python the caller maps them once.
+    pub fn filter_problem(&self, position: PositionSpace) -> Option<String> {
+        // The variant without features takes no positions.
+        let same = self.normalizer.position == position || self.model.variant == Variant::ColorOnly;
+        let name = |space: PositionSpace| match space {
+            PositionSpace::Scene => "scene",
+            PositionSpace::Image => "image",
+        };
+        (!same).then(|| {
+            let [own, theirs] = [self.normalizer.position, position].map(name);
+            format!(
+                "the albedo filter was trained with data.position = \"{own}\", the network with \
+                 \"{theirs}\"; train the filter with \"{theirs}\""
+            )
+        })
+    }
+}

@@ -1,0 +1,25 @@
+//! How far denoising has come, and who hears of it.
+
+use std::ops::ControlFlow;
+
+/// How far denoising an image has come.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct DenoiseProgress {
+    /// The tile that is computed, from 0.
+    pub tile: usize,
+    /// Number of tiles.
+    pub tiles: usize,
+    /// Finished share of the image, from 0 to 1. It stays at 0 in the pass of an albedo filter and
+    /// at 1 in that of alpha.
+    pub share: f64,
+}
+
+/// Receives the progress, and may stop the work. On the CPU it is called for every band of rows,
+/// elsewhere for every tile.
+pub type DenoiseObserver<'a> = dyn FnMut(DenoiseProgress) -> ControlFlow<()> + 'a;
+
+/// Lets the work finish.
+pub fn unobserved(_: DenoiseProgress) -> ControlFlow<()> {
+    ControlFlow::Continue(())
+}
