@@ -4,6 +4,7 @@ use std::path::Path;
 
 use crate::error::Error;
 use crate::image::exr::ExrFile;
+use crate::image::plane::NonFiniteSamples;
 
 /// An image as planar `f32`.
 #[derive(Debug, Clone, PartialEq)]
@@ -45,7 +46,12 @@ pub fn read_rgb(path: &Path) -> Result<Rgb, Error> {
     let mut planes = Vec::with_capacity(3 * window.width * window.height);
     let mut clamped = 0;
     for (name, mut plane) in names.iter().zip(file.read(&names)?) {
-        if let Some((index, value, count)) = plane.non_finite() {
+        if let Some(NonFiniteSamples {
+            index,
+            value,
+            count,
+        }) = plane.non_finite()
+        {
             return Err(Error::NonFinite {
                 path: path.to_owned(),
                 channel: (*name).to_owned(),
