@@ -22,7 +22,7 @@ pub struct Rgb {
 /// Reads `R`, `G`, `B`, or `LAYER.R`, `LAYER.G`, `LAYER.B` of the only layer that has them.
 ///
 /// # Errors
-/// [`Error::Read`] and [`Error::Exr`] for a file that cannot be decoded. [`Error::MissingChannels`]
+/// [`Error::File`] and [`Error::Exr`] for a file that cannot be decoded. [`Error::MissingChannels`]
 /// without such channels, or with those of several layers. [`Error::Sizes`] and
 /// [`Error::NonFinite`] for unusable channels.
 pub fn read_rgb(path: &Path) -> Result<Rgb, Error> {
