@@ -184,9 +184,9 @@ pub fn remove_abandoned(dir: &Path, names: Option<&[OsString]>) {
     let entries = fs::read_dir(if is_current { Path::new(".") } else { dir });
     for entry in entries.into_iter().flatten().flatten() {
         let hidden = entry.file_name();
-        if let Some((stem, host, process)) = parse_temporary(&hidden)
-            && stems.as_ref().is_none_or(|stems| stems.contains(stem))
-            && is_abandoned(&entry.path(), host, process)
+        if let Some(name) = TemporaryName::parse(&hidden)
+            && stems.as_ref().is_none_or(|stems| stems.contains(name.stem))
+            && is_abandoned(&entry.path(), name.host, name.process)
         {
             let _ = fs::remove_file(entry.path());
         }
@@ -301,12 +301,26 @@ fn hidden_stem(name: &OsStr) -> OsString {
     hidden
 }
 
-/// `.NAME`, host and process of `.NAME.HOST-PID.tmp`.
-fn parse_temporary(hidden: &OsStr) -> Option<(&OsStr, &str, u32)> {
-    let hidden = Path::new(hidden);
-    let with_process = Path::new(hidden.file_stem()?);
-    let (host, process) = with_process.extension()?.to_str()?.rsplit_once('-')?;
-    let stem = with_process.file_stem()?;
-    let is_hidden = stem.as_encoded_bytes().starts_with(b".");
-    (is_hidden && hidden.extension()? == "tmp").then_some((stem, host, process.parse().ok()?))
+/// The parts of `.NAME.HOST-PID.tmp`.
+struct TemporaryName<'a> {
+    /// `.NAME`.
+    stem: &'a OsStr,
+    host: &'a str,
+    process: u32,
+}
+
+impl<'a> TemporaryName<'a> {
+    /// `None` for other names.
+    fn parse(hidden: &'a OsStr) -> Option<Self> {
+        let hidden = Path::new(hidden);
+        let with_process = Path::new(hidden.file_stem()?);
+        let (host, process) = with_process.extension()?.to_str()?.rsplit_once('-')?;
+        let stem = with_process.file_stem()?;
+        let is_hidden = stem.as_encoded_bytes().starts_with(b".");
+        (is_hidden && hidden.extension()? == "tmp").then_some(Self {
+            stem,
+            host,
+            process: process.parse().ok()?,
+        })
+    }
 }

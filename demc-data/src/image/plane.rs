@@ -22,6 +22,17 @@ pub enum Plane {
     Uint(Vec<u32>),
 }
 
+/// The NaN and infinite samples of a plane.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct NonFiniteSamples {
+    /// Index of the first one.
+    pub index: usize,
+    /// Its value.
+    pub value: f32,
+    /// Number of all.
+    pub count: usize,
+}
+
 impl Plane {
     /// A half plane of `samples` zeros, for a buffer that a layout declares as zeros.
     pub fn zeros(samples: usize) -> Self {
@@ -114,9 +125,8 @@ impl Plane {
         }
     }
 
-    /// The first NaN or infinite sample (index and value) and the number of such samples, or
-    /// `None`.
-    pub fn non_finite(&self) -> Option<(usize, f32, usize)> {
+    /// The NaN and infinite samples; `None` if there are none.
+    pub fn non_finite(&self) -> Option<NonFiniteSamples> {
         match self {
             Plane::Half(samples) => bad(samples, f16::is_finite, f16::to_f32),
             Plane::Float(samples) => bad(samples, f32::is_finite, f32::from),
@@ -191,13 +201,17 @@ fn bad<T: Copy>(
     samples: &[T],
     finite: impl Fn(T) -> bool,
     value: impl Fn(T) -> f32,
-) -> Option<(usize, f32, usize)> {
+) -> Option<NonFiniteSamples> {
     let count = samples.iter().filter(|sample| !finite(**sample)).count();
     if count == 0 {
         return None;
     }
     let index = samples.iter().position(|sample| !finite(*sample))?;
-    Some((index, value(samples[index]), count))
+    Some(NonFiniteSamples {
+        index,
+        value: value(samples[index]),
+        count,
+    })
 }
 
 fn clamp<T: PartialOrd + Copy>(samples: &mut [T], zero: T) -> usize {
@@ -266,10 +280,13 @@ mod tests {
 
     #[test]
     fn the_first_bad_sample_is_named_and_all_are_counted() {
-        let (index, value, count) = half(&[0.0, f32::INFINITY, 2.0, f32::NAN])
-            .non_finite()
-            .expect("two bad samples");
-        assert_eq!((index, value, count), (1, f32::INFINITY, 2));
+        let bad = NonFiniteSamples {
+            index: 1,
+            value: f32::INFINITY,
+            count: 2,
+        };
+        let plane = half(&[0.0, f32::INFINITY, 2.0, f32::NAN]);
+        assert_eq!(plane.non_finite(), Some(bad));
         assert!(half(&[1.0]).non_finite().is_none());
     }
 

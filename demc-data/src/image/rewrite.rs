@@ -56,9 +56,9 @@ pub fn write_denoised(
 /// `[4, height, width]` with the layout's alpha.
 ///
 /// # Errors
-/// [`Error::Read`], [`Error::Exr`] and [`Error::MissingChannels`] for the input, as
+/// [`Error::File`], [`Error::Exr`] and [`Error::MissingChannels`] for the input, as
 /// [`ExrFile::read`]. [`Error::Sizes`] if its colour channels cover different pixels.
-/// [`Error::Exr`] if their number differs from `color_hdr`. [`Error::Write`] for the output.
+/// [`Error::Exr`] if their number differs from `color_hdr`. [`Error::File`] for the output.
 pub fn rewrite<R: Read + Seek>(
     file: &mut ExrFile<R>,
     layout: &ChannelLayout,

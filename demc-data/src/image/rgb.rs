@@ -4,6 +4,7 @@ use std::path::Path;
 
 use crate::error::Error;
 use crate::image::exr::ExrFile;
+use crate::image::plane::NonFiniteSamples;
 
 /// An image as planar `f32`.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,7 +22,7 @@ pub struct Rgb {
 /// Reads `R`, `G`, `B`, or `LAYER.R`, `LAYER.G`, `LAYER.B` of the only layer that has them.
 ///
 /// # Errors
-/// [`Error::Read`] and [`Error::Exr`] for a file that cannot be decoded. [`Error::MissingChannels`]
+/// [`Error::File`] and [`Error::Exr`] for a file that cannot be decoded. [`Error::MissingChannels`]
 /// without such channels, or with those of several layers. [`Error::Sizes`] and
 /// [`Error::NonFinite`] for unusable channels.
 pub fn read_rgb(path: &Path) -> Result<Rgb, Error> {
@@ -45,7 +46,12 @@ pub fn read_rgb(path: &Path) -> Result<Rgb, Error> {
     let mut planes = Vec::with_capacity(3 * window.width * window.height);
     let mut clamped = 0;
     for (name, mut plane) in names.iter().zip(file.read(&names)?) {
-        if let Some((index, value, count)) = plane.non_finite() {
+        if let Some(NonFiniteSamples {
+            index,
+            value,
+            count,
+        }) = plane.non_finite()
+        {
             return Err(Error::NonFinite {
                 path: path.to_owned(),
                 channel: (*name).to_owned(),

@@ -136,14 +136,10 @@ impl DataConfig {
                 problems.push(format!("data.{key} = {value:?}: must be {allowed}"));
             }
         };
+        let (has_root, has_layout) = (!self.root.as_os_str().is_empty(), !self.layout.is_empty());
+        require(has_root, "root", &self.root, "the directory of a data set");
         require(
-            !self.root.as_os_str().is_empty(),
-            "root",
-            &self.root,
-            "the directory of a data set",
-        );
-        require(
-            !self.layout.is_empty(),
+            has_layout,
             "layout",
             &self.layout,
             "a preset or a TOML file",

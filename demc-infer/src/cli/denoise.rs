@@ -4,10 +4,10 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use demc_data::ChannelLayout;
 use demc_data::image::exr::{Compression, ExrFile};
 use demc_data::image::frame::{decode_input, decode_repaired};
 use demc_data::image::rewrite::{OutputChannels, WriteOptions, rewrite_with_layers};
+use demc_data::{ChannelLayout, Frame};
 use demc_program::message;
 use demc_program::output::{Directories, Outputs};
 
@@ -22,7 +22,7 @@ use super::layouts::{LayoutFlags, Layouts};
 use super::progress::Progress;
 use super::shard::Shard;
 use super::warnings::Warnings;
-use crate::denoise::{DenoiseOptions, DenoiseProgress, SeamError};
+use crate::denoise::{DenoiseOptions, DenoiseProgress, Layer, SeamError};
 use crate::guard::{EnergyBias, Warning};
 use crate::{Bundle, Picture, memory};
 
@@ -136,18 +136,7 @@ impl Arguments {
         if !self.overwrite {
             jobs.skip_done(&mut outputs);
         }
-        if jobs.skipped > 0 {
-            let (done, all) = (jobs.skipped, jobs.skipped + jobs.list.len());
-            message::say(format_args!(
-                "note: {done} of {all} images already exist; --overwrite replaces them"
-            ));
-        }
-        if jobs.kept_previews > 0 {
-            let kept = jobs.kept_previews;
-            message::say(format_args!(
-                "note: existing previews are kept: {kept}; --overwrite replaces them"
-            ));
-        }
+        jobs.report_skipped();
         let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
         self.layers.check(&bundle, self.ensemble.passes)?;
@@ -157,18 +146,28 @@ impl Arguments {
             Directories::Expect
         })?;
         let jobs = jobs.list;
-        let progress = Progress::new(jobs.len());
+        let work = Work {
+            bundle,
+            layouts,
+            progress: Progress::new(jobs.len()),
+            warnings: Warnings::default(),
+        };
+        let Work {
+            bundle,
+            layouts,
+            progress,
+            ..
+        } = &work;
         let mut scales = SequenceScales::new(&inputs.sequences);
-        let warnings = Warnings::default();
         let mut clamped = Clamped::default();
         let mut failed = 0;
         for job in &jobs {
             progress.start(job.input.display());
             let scale = match self.input_scale.choice.factor() {
-                None => scales.of(&job.input, &bundle, &layouts),
+                None => scales.of(&job.input, bundle, layouts),
                 given => given,
             };
-            match self.image(job, scale, &bundle, &layouts, &progress, &warnings) {
+            match self.image(&work, job, scale) {
                 Ok(samples) => clamped.count(samples),
                 Err(error) if jobs.len() == 1 => return Err(error),
                 Err(error) => {
@@ -178,8 +177,8 @@ impl Arguments {
             }
             progress.advance();
         }
-        progress.finish();
-        for line in warnings.rest() {
+        work.progress.finish();
+        for line in work.warnings.rest() {
             message::say(format_args!("warning: {line}"));
         }
         clamped.report();
@@ -194,38 +193,26 @@ impl Arguments {
 
     /// Denoises one image, by default with the scale of its own exposure. Returns the number of
     /// negative samples, which were set to 0.
-    fn image(
-        &self,
-        job: &Job,
-        input_scale: Option<f32>,
-        bundle: &Bundle,
-        layouts: &Layouts,
-        progress: &Progress,
-        warnings: &Warnings,
-    ) -> anyhow::Result<usize> {
+    fn image(&self, work: &Work, job: &Job, input_scale: Option<f32>) -> anyhow::Result<usize> {
+        let Work {
+            bundle,
+            layouts,
+            progress,
+            warnings,
+        } = work;
         let name = job.input.display();
         let file = ExrFile::open(&job.input)?;
         let say = |choice: &str| progress.line(format_args!("note: {name}: {choice}"));
         let layout = &layouts.of(&file, bundle, say)?;
         let names = self.layers.names(&file, layout)?;
         let mut file = file.keeping(&layout.color, cache_bytes());
-        let (mut frame, repaired) = if self.repair {
-            decode_repaired(&mut file, layout)?
-        } else {
-            (decode_input(&mut file, layout)?, 0)
-        };
-        let (layers, more) = read_layers(&mut file, layout, &names, self.repair)?;
-        if repaired + more > 0 {
-            let repaired = repaired + more;
+        let Contents {
+            frame,
+            layers,
+            repaired,
+        } = self.contents(&mut file, layout, &names)?;
+        if repaired > 0 {
             progress.line(format_args!("note: {name}: {repaired} samples repaired"));
-        }
-        if layout
-            .alpha
-            .as_ref()
-            .is_some_and(|alpha| names.contains(alpha))
-        {
-            // As a layer, alpha needs no pass of its own.
-            frame.alpha = None;
         }
         let warn = |warning: &Warning| {
             if let Some(line) = warnings.first(&job.input, warning) {
@@ -255,15 +242,8 @@ impl Arguments {
             progress.line(format_args!("note: {name}: {plan}"));
         }
         if let Some(error) = denoised.seam_error {
-            let SeamError {
-                relmse,
-                largest,
-                windows,
-            } = error;
-            progress.line(format_args!(
-                "note: {name}: error at seams, from {windows} windows denoised exactly: RelMSE {relmse:.2e}, \
-                 largest difference {largest:.2e} of the largest value"
-            ));
+            let error = described(&error);
+            progress.line(format_args!("note: {name}: {error}"));
         }
         let image = &denoised.color_hdr;
         EnergyBias::of(&frame, image)
@@ -290,6 +270,60 @@ impl Arguments {
         }
         Ok(frame.clamped)
     }
+
+    /// Decodes the frame and these layers, and repairs them if wanted.
+    fn contents(
+        &self,
+        file: &mut ExrFile,
+        layout: &ChannelLayout,
+        names: &[String],
+    ) -> anyhow::Result<Contents> {
+        let (mut frame, repaired) = if self.repair {
+            decode_repaired(file, layout)?
+        } else {
+            (decode_input(file, layout)?, 0)
+        };
+        let (layers, more) = read_layers(file, layout, names, self.repair)?;
+        let alpha = layout.alpha.as_ref();
+        if alpha.is_some_and(|alpha| names.contains(alpha)) {
+            // As a layer, alpha needs no pass of its own.
+            frame.alpha = None;
+        }
+        Ok(Contents {
+            frame,
+            layers,
+            repaired: repaired + more,
+        })
+    }
+}
+
+/// The error at seams, in words.
+fn described(error: &SeamError) -> String {
+    let SeamError {
+        relmse,
+        largest,
+        windows,
+    } = error;
+    format!(
+        "error at seams, from {windows} windows denoised exactly: RelMSE {relmse:.2e}, \
+         largest difference {largest:.2e} of the largest value"
+    )
+}
+
+/// What all images of a command share.
+struct Work<'a> {
+    bundle: Bundle,
+    layouts: Layouts<'a>,
+    progress: Progress,
+    warnings: Warnings,
+}
+
+/// What is denoised of a file.
+struct Contents {
+    frame: Frame,
+    layers: Vec<Layer>,
+    /// Number of samples that were repaired.
+    repaired: usize,
 }
 
 /// `--precision`, `--compression`, `--only-color`.

@@ -2,6 +2,7 @@
 
 use std::ffi::OsStr;
 use std::fs;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use demc_program::exit::UsageError;
@@ -160,12 +161,12 @@ struct SequencePattern<'a> {
 impl<'a> SequencePattern<'a> {
     fn parse(argument: &'a Path) -> Option<Self> {
         let name = argument.file_name()?.to_str()?;
-        let (start, end, digits) = hashes(name).or_else(|| percent(name))?;
+        let NumberField { place, digits } = hashes(name).or_else(|| percent(name))?;
         Some(Self {
             argument,
-            prefix: name[..start].to_owned(),
+            prefix: name[..place.start].to_owned(),
             digits,
-            suffix: name[end..].to_owned(),
+            suffix: name[place.end..].to_owned(),
         })
     }
 
@@ -229,23 +230,35 @@ impl<'a> SequencePattern<'a> {
     }
 }
 
-/// The first run of `#`: start, end, length.
-fn hashes(name: &str) -> Option<(usize, usize, usize)> {
+/// Where a file name has the number of a frame.
+struct NumberField {
+    /// Bytes of the name.
+    place: Range<usize>,
+    /// Number of digits.
+    digits: usize,
+}
+
+/// The first run of `#`.
+fn hashes(name: &str) -> Option<NumberField> {
     let start = name.find('#')?;
     let digits = name[start..]
         .bytes()
         .take_while(|byte| *byte == b'#')
         .count();
-    Some((start, start + digits, digits))
+    let place = start..start + digits;
+    Some(NumberField { place, digits })
 }
 
-/// `%d`, `%4d` or `%04d`: start, end, digits.
-fn percent(name: &str) -> Option<(usize, usize, usize)> {
+/// `%d`, `%4d` or `%04d`.
+fn percent(name: &str) -> Option<NumberField> {
     let start = name.find('%')?;
     let length = name[start + 1..].find(|c: char| !c.is_ascii_digit())?;
     let width = &name[start + 1..][..length];
     let end = start + 1 + length + 1;
-    (name[..end].ends_with('d')).then(|| (start, end, width.parse().unwrap_or(1)))
+    name[..end].ends_with('d').then(|| NumberField {
+        place: start..end,
+        digits: width.parse().unwrap_or(1),
+    })
 }
 
 #[cfg(test)]

@@ -135,8 +135,13 @@ impl ModelSummary {
             t,
             "| ---------- | ------------------------------------ | -------------- |"
         )?;
-        for (buffer, channels, missing) in buffers(&meta.layout) {
-            writeln!(t, "| {buffer:<10} | {channels:<36} | {missing:<14} |")?;
+        for BufferRow {
+            name,
+            channels,
+            missing,
+        } in buffers(&meta.layout)
+        {
+            writeln!(t, "| {name:<10} | {channels:<36} | {missing:<14} |")?;
         }
 
         if !self.tensors.is_empty() {
@@ -150,24 +155,33 @@ impl ModelSummary {
     }
 }
 
-/// The buffers of a layout: name, channels, and the replacement for missing channels.
-fn buffers(layout: &ChannelLayout) -> Vec<(&'static str, String, &'static str)> {
+/// A buffer of a layout.
+struct BufferRow {
+    name: &'static str,
+    channels: String,
+    /// The replacement for missing channels.
+    missing: &'static str,
+}
+
+/// The buffers of a layout.
+fn buffers(layout: &ChannelLayout) -> Vec<BufferRow> {
     let channels = |names: Option<&[String; 3]>| {
         names.map_or("none".into(), |names| printable(&names.join(" ")))
     };
-    let mut rows = vec![("color", channels(Some(&layout.color)), "refused")];
+    let row = |name, names, missing| BufferRow {
+        name,
+        channels: channels(names),
+        missing,
+    };
+    let mut rows = vec![row("color", Some(&layout.color), "refused")];
     for (buffer, names, missing) in layout.features() {
         let missing = match missing {
             Missing::Error => "refused",
             Missing::Zeros => "zeros",
             Missing::CopyTexture1 => "texture1",
         };
-        rows.push((buffer, channels(names), missing));
+        rows.push(row(buffer, names, missing));
     }
-    rows.push((
-        "reference",
-        channels(layout.reference.as_ref()),
-        "no scores",
-    ));
+    rows.push(row("reference", layout.reference.as_ref(), "no scores"));
     rows
 }

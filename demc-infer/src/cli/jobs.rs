@@ -6,6 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use demc_program::exit::UsageError;
+use demc_program::message;
 use demc_program::output::{OutputError, Outputs};
 
 use super::inputs::Inputs;
@@ -107,6 +108,22 @@ impl Jobs {
             .iter()
             .flat_map(|job| job.output.iter().chain(&job.preview));
         files.try_for_each(|file| outputs.claim(file, overwrite || self.directory))
+    }
+
+    /// Says how many images and previews are skipped.
+    pub fn report_skipped(&self) {
+        if self.skipped > 0 {
+            let (done, all) = (self.skipped, self.skipped + self.list.len());
+            message::say(format_args!(
+                "note: {done} of {all} images already exist; --overwrite replaces them"
+            ));
+        }
+        if self.kept_previews > 0 {
+            let kept = self.kept_previews;
+            message::say(format_args!(
+                "note: existing previews are kept: {kept}; --overwrite replaces them"
+            ));
+        }
     }
 
     /// Removes what exists in the output directory, also from `outputs`. Files are written

@@ -134,7 +134,8 @@ impl Scenes {
             progress.start(&scene.name);
             let denoise = |frame: &Frame| bundle.denoise_with(frame, &options, unobserved);
             let process = |images: &SceneImages| process(images, scenes.len());
-            match self.score_scene(scene, layout, denoise, process, &mut clamped) {
+            let files = self.read_scene(scene, layout, &mut clamped);
+            match files.and_then(|files| self.score_scene(scene, &files, denoise, process)) {
                 Ok((score, processed)) => {
                     finish(processed, &score)?;
                     images.push(score);
@@ -160,42 +161,53 @@ impl Scenes {
     fn score_scene<T: Send>(
         &self,
         scene: &Scene,
-        layout: &ChannelLayout,
+        files: &SceneFiles,
         denoise: impl Fn(&Frame) -> Result<Denoised, DenoiseError>,
         process: impl Fn(&SceneImages) -> anyhow::Result<T> + Sync,
-        clamped: &mut Clamped,
     ) -> anyhow::Result<(ImageScore, T)> {
-        let mut frame = demc_data::read_frame(&scene.path, layout)?;
-        frame.name.clone_from(&scene.name);
-        clamped.count(frame.clamped);
-        let others = self.read_baselines(scene, clamped)?;
+        let SceneFiles { frame, baselines } = files;
         let others: Vec<_> = self
             .baselines
             .iter()
-            .zip(&others)
+            .zip(baselines)
             .map(|(baseline, image)| (baseline.name.as_str(), image.planes.as_slice()))
             .collect();
-        let denoised = denoise(&frame)?.color_hdr;
+        let denoised = denoise(frame)?.color_hdr;
         let residual = scene.ref_residual_relmse;
         let scene_images = SceneImages {
-            frame: &frame,
+            frame,
             denoised: &denoised,
             baselines: &others,
         };
         let (score, processed) = rayon::join(
-            || ImageScore::full(&frame, &denoised, &others, residual),
+            || ImageScore::full(frame, &denoised, &others, residual),
             || process(&scene_images),
         );
         Ok((score?, processed?))
     }
 
-    fn read_baselines(&self, scene: &Scene, clamped: &mut Clamped) -> anyhow::Result<Vec<Rgb>> {
-        let mut images = Vec::with_capacity(self.baselines.len());
+    fn read_scene(
+        &self,
+        scene: &Scene,
+        layout: &ChannelLayout,
+        clamped: &mut Clamped,
+    ) -> anyhow::Result<SceneFiles> {
+        let mut frame = demc_data::read_frame(&scene.path, layout)?;
+        frame.name.clone_from(&scene.name);
+        clamped.count(frame.clamped);
+        let mut baselines = Vec::with_capacity(self.baselines.len());
         for baseline in &self.baselines {
             let image = baseline.read(scene)?;
             clamped.count(image.clamped);
-            images.push(image);
+            baselines.push(image);
         }
-        Ok(images)
+        Ok(SceneFiles { frame, baselines })
     }
+}
+
+/// The images of a scene.
+struct SceneFiles {
+    frame: Frame,
+    /// In the order of the command line.
+    baselines: Vec<Rgb>,
 }

@@ -76,12 +76,13 @@ fn around(noisy: &[f32], denoised: &[f32], width: usize, factors: &mut [f32]) {
         .par_chunks_mut(width)
         .zip(denoised.par_chunks(width));
     rows.enumerate().for_each(|(y, (factors, denoised))| {
-        let (top, bottom, down) = neighbours(y, grid[0]);
-        let [top, bottom] = [top, bottom].map(|row| &ratios[row * grid[1]..][..grid[1]]);
+        let lines = Neighbours::of(y, grid[0]);
+        let [top, bottom] = lines.blocks.map(|row| &ratios[row * grid[1]..][..grid[1]]);
         for (x, (factor, &value)) in factors.iter_mut().zip(denoised).enumerate() {
-            let (left, right, across) = neighbours(x, grid[1]);
-            let mix = |row: &[f32]| row[left] + (row[right] - row[left]) * across;
-            let ratio = mix(top) + (mix(bottom) - mix(top)) * down;
+            let columns = Neighbours::of(x, grid[1]);
+            let [left, right] = columns.blocks;
+            let mix = |row: &[f32]| row[left] + (row[right] - row[left]) * columns.share;
+            let ratio = mix(top) + (mix(bottom) - mix(top)) * lines.share;
             *factor = limited(ratio, value);
         }
     });
@@ -116,12 +117,23 @@ fn limited(ratio: f32, denoised: f32) -> f32 {
     (1.0 + ratio * denoised.sqrt()).clamp(low, high)
 }
 
-/// The two blocks whose centres are around a pixel's centre, and the share of the second.
-fn neighbours(pixel: usize, blocks: usize) -> (usize, usize, f32) {
-    let at = (pixel as f32 + 0.5) / BLOCK as f32 - 0.5;
-    let at = at.clamp(0.0, (blocks - 1) as f32);
-    let first = at as usize;
-    (first, (first + 1).min(blocks - 1), at - first as f32)
+/// The two blocks whose centres are around a pixel's centre.
+struct Neighbours {
+    blocks: [usize; 2],
+    /// The share of the second.
+    share: f32,
+}
+
+impl Neighbours {
+    fn of(pixel: usize, blocks: usize) -> Self {
+        let position = (pixel as f32 + 0.5) / BLOCK as f32 - 0.5;
+        let position = position.clamp(0.0, (blocks - 1) as f32);
+        let first = position as usize;
+        Self {
+            blocks: [first, (first + 1).min(blocks - 1)],
+            share: position - first as f32,
+        }
+    }
 }
 
 /// Sums over pixels.

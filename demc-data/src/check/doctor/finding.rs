@@ -22,7 +22,7 @@ pub struct Affected {
     pub detail: String,
 }
 
-/// The findings of [`examine`].
+/// The findings of [`examine`](super::examine).
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Report {
     /// The layout that the files were read with.

@@ -30,20 +30,34 @@ pub enum Compression {
     Dwab,
 }
 
-/// Name, our type and the `exr` crate's type. Methods without our type cannot be written.
-const TABLE: [(&str, Option<Compression>, Method); 12] = [
-    ("none", Some(Compression::None), Method::Uncompressed),
-    ("rle", Some(Compression::Rle), Method::RLE),
-    ("zips", Some(Compression::Zips), Method::ZIP1),
-    ("zip", Some(Compression::Zip), Method::ZIP16),
-    ("piz", Some(Compression::Piz), Method::PIZ),
-    ("pxr24", Some(Compression::Pxr24), Method::PXR24),
-    ("b44", Some(Compression::B44), Method::B44),
-    ("b44a", Some(Compression::B44a), Method::B44A),
-    ("dwaa", Some(Compression::Dwaa), Method::DWAA(None)),
-    ("dwab", Some(Compression::Dwab), Method::DWAB(None)),
-    ("htj2k32", None, Method::HTJ2K32),
-    ("htj2k256", None, Method::HTJ2K256),
+/// A compression of files.
+struct KnownMethod {
+    name: &'static str,
+    /// Our type; `None` for a method that cannot be written.
+    ours: Option<Compression>,
+    /// The type of the `exr` crate.
+    method: Method,
+}
+
+impl KnownMethod {
+    const fn new(name: &'static str, ours: Option<Compression>, method: Method) -> Self {
+        Self { name, ours, method }
+    }
+}
+
+const TABLE: [KnownMethod; 12] = [
+    KnownMethod::new("none", Some(Compression::None), Method::Uncompressed),
+    KnownMethod::new("rle", Some(Compression::Rle), Method::RLE),
+    KnownMethod::new("zips", Some(Compression::Zips), Method::ZIP1),
+    KnownMethod::new("zip", Some(Compression::Zip), Method::ZIP16),
+    KnownMethod::new("piz", Some(Compression::Piz), Method::PIZ),
+    KnownMethod::new("pxr24", Some(Compression::Pxr24), Method::PXR24),
+    KnownMethod::new("b44", Some(Compression::B44), Method::B44),
+    KnownMethod::new("b44a", Some(Compression::B44a), Method::B44A),
+    KnownMethod::new("dwaa", Some(Compression::Dwaa), Method::DWAA(None)),
+    KnownMethod::new("dwab", Some(Compression::Dwab), Method::DWAB(None)),
+    KnownMethod::new("htj2k32", None, Method::HTJ2K32),
+    KnownMethod::new("htj2k256", None, Method::HTJ2K256),
 ];
 
 /// An unknown compression name.
@@ -68,31 +82,31 @@ impl Compression {
 
     /// Its name, such as `zip` or `dwaa`.
     pub fn name(self) -> &'static str {
-        let row = TABLE.iter().find(|(_, ours, _)| *ours == Some(self));
-        row.map_or("", |(name, ..)| name)
+        let row = TABLE.iter().find(|row| row.ours == Some(self));
+        row.map_or("", |row| row.name)
     }
 
     pub(super) fn method(self) -> Method {
-        let row = TABLE.iter().find(|(_, ours, _)| *ours == Some(self));
-        row.map_or(Method::ZIP16, |(.., method)| *method)
+        let row = TABLE.iter().find(|row| row.ours == Some(self));
+        row.map_or(Method::ZIP16, |row| row.method)
     }
 
     /// `None` for a method that cannot be written.
     pub(super) fn of(method: Method) -> Option<Self> {
-        row_of(method).and_then(|(_, ours, _)| *ours)
+        row_of(method).and_then(|row| row.ours)
     }
 }
 
 pub(super) fn name_of(method: Method) -> &'static str {
-    row_of(method).map_or("unknown", |(name, ..)| name)
+    row_of(method).map_or("unknown", |row| row.name)
 }
 
-fn row_of(method: Method) -> Option<&'static (&'static str, Option<Compression>, Method)> {
+fn row_of(method: Method) -> Option<&'static KnownMethod> {
     // Compares variants only, because a DWA method carries a level.
     let kind = std::mem::discriminant(&method);
     TABLE
         .iter()
-        .find(|(.., known)| std::mem::discriminant(known) == kind)
+        .find(|row| std::mem::discriminant(&row.method) == kind)
 }
 
 impl fmt::Display for Compression {

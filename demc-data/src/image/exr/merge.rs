@@ -71,7 +71,7 @@ pub struct Merged {
 ///
 /// # Errors
 /// [`Error::Merge`] without files, for channels of one name, and for channels that cover different
-/// pixels. [`Error::Exr`] and [`Error::Read`] for a damaged input. [`Error::Write`] for the output.
+/// pixels. [`Error::Exr`] and [`Error::File`] for a damaged input; [`Error::File`] also for the output.
 pub fn merge<R: Read + Seek>(inputs: &mut [MergeInput<R>], output: &Path) -> Result<Merged, Error> {
     let mut columns = columns(inputs)?;
     check_windows(inputs, &columns)?;

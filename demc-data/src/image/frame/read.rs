@@ -11,7 +11,7 @@ use crate::error::Error;
 use crate::image::channel::Window;
 use crate::image::exr::ExrFile;
 use crate::image::layout::ChannelLayout;
-use crate::image::plane::{Plane, clear_infinite};
+use crate::image::plane::{NonFiniteSamples, Plane, clear_infinite};
 
 /// Reads and checks an image. Reference and mask are read if present.
 ///
@@ -220,7 +220,11 @@ pub fn check_open_header<R: Read + Seek>(
 pub(super) fn finite(path: &Path, name: &str, width: usize, plane: Plane) -> Result<Plane, Error> {
     match plane.non_finite() {
         None => Ok(plane),
-        Some((index, value, count)) => Err(Error::NonFinite {
+        Some(NonFiniteSamples {
+            index,
+            value,
+            count,
+        }) => Err(Error::NonFinite {
             path: path.to_owned(),
             channel: name.to_owned(),
             value,

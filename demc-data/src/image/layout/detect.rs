@@ -125,6 +125,29 @@ impl ChannelLayout {
         layers.filter(is_whole).map(str::to_owned).collect()
     }
 
+    /// The view layers of a file that may fit, or only `layer` if it is given; `[None]` if the names
+    /// need none. `None` if no view layer can fit.
+    fn layers_to_try<R: Read + Seek>(
+        &self,
+        file: &ExrFile<R>,
+        layer: Option<&str>,
+    ) -> Result<Option<Vec<Option<String>>>, Error> {
+        let found = self.layers(file);
+        Ok(match (self.has_any_layer(), layer) {
+            (true, Some(layer)) => {
+                if !found.is_empty() && !found.iter().any(|name| name == layer) {
+                    let found = list(&found);
+                    let detail = format!("no view layer {layer:?}; there is {found}");
+                    return Err(problem(file, detail));
+                }
+                Some(vec![Some(layer.to_owned())])
+            }
+            (true, None) if !found.is_empty() => Some(found.into_iter().map(Some).collect()),
+            (_, None) => Some(vec![None]),
+            (false, Some(_)) => None,
+        })
+    }
+
     /// This layout with alternatives in place of names that the file lacks, and without the others.
     fn named_as_in<R: Read + Seek>(mut self, file: &ExrFile<R>) -> Self {
         let Alternatives {
@@ -174,26 +197,12 @@ pub fn detect<R: Read + Seek>(
     layer: Option<&str>,
 ) -> Result<FileLayout, Error> {
     let mut fits: Vec<FileLayout> = Vec::new();
-    // Number of channels found, the preset, and the channels that it lacks.
-    let mut nearest: (usize, &str, Vec<String>) = (0, "", Vec::new());
+    let mut nearest: Option<NearestPreset> = None;
     for (preset, text) in PRESETS {
         let pattern = ChannelLayout::from_toml(preset, text).expect("presets are valid");
         let missing = missing.or(pattern.missing);
-        let found = pattern.layers(file);
-        let layers = match (pattern.has_any_layer(), layer) {
-            (true, Some(layer)) => {
-                if !found.is_empty() && !found.iter().any(|name| name == layer) {
-                    let found = list(&found);
-                    return Err(problem(
-                        file,
-                        format!("no view layer {layer:?}; there is {found}"),
-                    ));
-                }
-                vec![Some(layer.to_owned())]
-            }
-            (true, None) if !found.is_empty() => found.into_iter().map(Some).collect(),
-            (_, None) => vec![None],
-            (false, Some(_)) => continue,
+        let Some(layers) = pattern.layers_to_try(file, layer)? else {
+            continue;
         };
         for layer in layers {
             let layout = match &layer {
@@ -208,8 +217,12 @@ pub fn detect<R: Read + Seek>(
                     layer,
                     layout: without_absent(file, layout, missing),
                 });
-            } else if found > nearest.0 || nearest.1.is_empty() {
-                nearest = (found, preset, lacking);
+            } else if nearest.as_ref().is_none_or(|nearest| found > nearest.found) {
+                nearest = Some(NearestPreset {
+                    preset,
+                    found,
+                    lacking,
+                });
             }
         }
     }
@@ -217,36 +230,43 @@ pub fn detect<R: Read + Seek>(
     let most = fits.iter().map(buffers).max();
     fits.retain(|fit| Some(buffers(fit)) == most);
     fits.dedup_by(|a, b| a.layout == b.layout);
-    match fits.len() {
-        1 => Ok(fits.remove(0)),
-        0 if nearest.0 == 0 => {
-            let names = file.channels().iter().map(|channel| channel.name.clone());
-            let names = list(&names.collect::<Vec<_>>());
-            Err(problem(
-                file,
-                format!("no preset has any of its channels: {names}"),
-            ))
-        }
-        0 => {
-            let (_, preset, lacking) = nearest;
-            let lacking = list(&lacking);
-            Err(problem(
-                file,
-                format!("no preset fits; the nearest, {preset}, lacks {lacking}"),
-            ))
-        }
-        _ => {
-            let names = fits.iter().map(|fit| match &fit.layer {
-                Some(layer) => format!("{} with view layer {layer:?}", fit.preset),
-                None => fit.preset.to_owned(),
-            });
-            let names = list(&names.collect::<Vec<_>>());
-            Err(problem(
-                file,
-                format!("several presets fit equally well: {names}; choose one"),
-            ))
-        }
+    if fits.len() == 1 {
+        return Ok(fits.remove(0));
     }
+    if fits.len() > 1 {
+        let name = |fit: &FileLayout| match &fit.layer {
+            Some(layer) => format!("{} with view layer {layer:?}", fit.preset),
+            None => fit.preset.to_owned(),
+        };
+        let names = list(&fits.iter().map(name).collect::<Vec<_>>());
+        let detail = format!("several presets fit equally well: {names}; choose one");
+        return Err(problem(file, detail));
+    }
+    Err(problem(
+        file,
+        match nearest.filter(|nearest| nearest.found > 0) {
+            Some(NearestPreset {
+                preset, lacking, ..
+            }) => {
+                let lacking = list(&lacking);
+                format!("no preset fits; the nearest, {preset}, lacks {lacking}")
+            }
+            None => {
+                let names = file.channels().iter().map(|channel| channel.name.clone());
+                let names = list(&names.collect::<Vec<_>>());
+                format!("no preset has any of its channels: {names}")
+            }
+        },
+    ))
+}
+
+/// The preset with the most channels of a file, if none fits.
+struct NearestPreset {
+    preset: &'static str,
+    /// Number of its channels in the file.
+    found: usize,
+    /// Those that the file lacks.
+    lacking: Vec<String>,
 }
 
 /// Number of the layout's channels in the file, and those that the file must have but lacks.
