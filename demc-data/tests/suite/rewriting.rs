@@ -40,15 +40,12 @@ fn every_compression_and_block_shape_is_carried_over() {
                 from: compression.name(),
                 to: Compression::Zip,
             };
-            match changes(method) {
-                true => {
-                    assert_eq!(after.compression, Method::ZIP16, "{what}");
-                    assert_eq!(written.changes, [changed], "{what}");
-                }
-                false => {
-                    assert_eq!(before, after, "{what}");
-                    assert_eq!(written, Written::default(), "{what}");
-                }
+            if changes(method) {
+                assert_eq!(after.compression, Method::ZIP16, "{what}");
+                assert_eq!(written.changes, [changed], "{what}");
+            } else {
+                assert_eq!(before, after, "{what}");
+                assert_eq!(written, Written::default(), "{what}");
             }
         }
     }

@@ -20,9 +20,10 @@ fn python(arguments: &[&str]) -> Result<String, String> {
         .output();
     let output = output.map_err(|error| format!("{} does not start: {error}", python.display()))?;
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    match output.status.success() {
-        true => Ok(text(&output.stdout)),
-        false => Err(text(&output.stderr)),
+    if output.status.success() {
+        Ok(text(&output.stdout))
+    } else {
+        Err(text(&output.stderr))
     }
 }
 

@@ -64,9 +64,10 @@ fn each_image_is_in_one_shard_by_name() {
         let out = dir.path().join(shard.replace('/', "-of-"));
         let flags = ["--shard", shard];
         denoise(Some(run.path()), &sample().join("test"), &out, &flags).success();
-        match out.exists() {
-            true => files(&out).into_keys().collect(),
-            false => Vec::new(),
+        if out.exists() {
+            files(&out).into_keys().collect()
+        } else {
+            Vec::new()
         }
     };
     assert_eq!(

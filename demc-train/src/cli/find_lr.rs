@@ -114,11 +114,12 @@ pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<u8> {
     })?;
     progress.finish();
     let last = found.points.last().map_or(from, |point| point.lr);
-    match found.diverged {
-        true => say(format!(
+    if found.diverged {
+        say(format!(
             "the loss diverged at a learning rate of {last:.1e}"
-        )),
-        false => say(format!("the loss did not diverge up to {last:.1e}")),
+        ))
+    } else {
+        say(format!("the loss did not diverge up to {last:.1e}"))
     }
     match found.suggestion() {
         Some(lr) => say(format!(

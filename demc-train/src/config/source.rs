@@ -116,9 +116,10 @@ fn check_keys(
     report: &mut impl FnMut(usize, String),
 ) {
     for (key, value) in table {
-        let path = match prefix.is_empty() {
-            true => key.get_ref().to_string(),
-            false => format!("{prefix}.{}", key.get_ref()),
+        let path = if prefix.is_empty() {
+            key.get_ref().to_string()
+        } else {
+            format!("{prefix}.{}", key.get_ref())
         };
         let is_table = keys.iter().any(|k| k.starts_with(&format!("{path}.")));
         let is_boolean = matches!(value.get_ref(), DeValue::Boolean(_));
@@ -223,9 +224,10 @@ fn edit<'a>(set: &'a str, keys: &BTreeSet<String>) -> Result<Edit<'a>, String> {
         return Err("a line break or another control character; give one key and its value".into());
     }
     let text = value;
-    let value = match text.is_empty() {
-        true => None,
-        false => Some(text.parse().unwrap_or_else(|_| Value::String(text.into()))),
+    let value = if text.is_empty() {
+        None
+    } else {
+        Some(text.parse().unwrap_or_else(|_| Value::String(text.into())))
     };
     check_key(path, matches!(value, Some(Value::Boolean(_))), keys)?;
     let (table, key) = path

@@ -166,9 +166,10 @@ impl Ranks {
             return Ok(values);
         };
         let alike = errors.len() == received.len() && errors.iter().all(|other| other.1 == text);
-        let text = match alike {
-            true => text,
-            false => format!("rank {rank} on {}: {text}", group.node(rank)),
+        let text = if alike {
+            text
+        } else {
+            format!("rank {rank} on {}: {text}", group.node(rank))
         };
         Err(SharedError { text, code }.into())
     }

@@ -103,9 +103,10 @@ impl MetricsLog {
     /// A log that cannot be read or written.
     pub fn open(path: &Path, step: u64) -> anyhow::Result<Self> {
         let lost = step > 0 && !path.exists();
-        let bytes = match path.exists() {
-            true => fs::read(path).with_context(|| path.display().to_string())?,
-            false => Vec::new(),
+        let bytes = if path.exists() {
+            fs::read(path).with_context(|| path.display().to_string())?
+        } else {
+            Vec::new()
         };
         let StoredLines { lines, damaged } = read_lines::<LineStep>(&bytes);
         let kept = lines.iter().filter(|(_, line)| line.step <= step);

@@ -21,9 +21,10 @@ impl StepProgress {
         let style =
             ProgressStyle::with_template("{bar:16} step {pos}/{len}  {eta} left  {wide_msg}")
                 .expect("a constant template");
-        let bar = match message::is_silent() {
-            true => ProgressBar::hidden(),
-            false => ProgressBar::new(steps),
+        let bar = if message::is_silent() {
+            ProgressBar::hidden()
+        } else {
+            ProgressBar::new(steps)
         };
         let bar = bar.with_style(style).with_position(first);
         bar.reset_eta();

@@ -164,9 +164,10 @@ impl RunData {
             validation,
             test,
             normalizer: statistics.normalizer,
-            ranges: match config.data.augment.axes {
-                true => statistics.ranges.in_any_axes(),
-                false => statistics.ranges,
+            ranges: if config.data.augment.axes {
+                statistics.ranges.in_any_axes()
+            } else {
+                statistics.ranges
             },
             dropout: config.data.dropout,
             checksums,

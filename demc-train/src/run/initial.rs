@@ -51,14 +51,15 @@ impl InitialWeights {
             self.albedo_demodulation_epsilon,
             config.data.albedo_demodulation_epsilon,
         ];
-        match before == now {
-            true => note,
-            false => format!(
+        if before == now {
+            note
+        } else {
+            format!(
                 "{note}; data.albedo_demodulation_epsilon: {} instead of {}, so the network adapts to a \
                  different input colour first",
                 shown(now),
                 shown(before)
-            ),
+            )
         }
     }
 }
@@ -115,9 +116,10 @@ pub fn read_init(config: &Config) -> anyhow::Result<Option<BundleFile>> {
     // Its own initialisation does not matter.
     let theirs = file.meta.model.head;
     saved.model = ModelConfig {
-        head: match theirs.has_weights_of(config.model.head) {
-            true => config.model.head,
-            false => theirs,
+        head: if theirs.has_weights_of(config.model.head) {
+            config.model.head
+        } else {
+            theirs
         },
         detail: config.model.detail,
         ..file.meta.model

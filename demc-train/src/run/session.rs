@@ -276,9 +276,10 @@ impl Prepared {
         }
         let mut notes = Vec::new();
         // First, because it restores a damaged layout.
-        let checkpoint = match resume {
-            true => latest_checkpoint(config, dir.path(), !check, device, &mut notes)?,
-            false => None,
+        let checkpoint = if resume {
+            latest_checkpoint(config, dir.path(), !check, device, &mut notes)?
+        } else {
+            None
         };
         let (path, checkpoint) = checkpoint.unzip();
         let data = RunData::open(config)?;

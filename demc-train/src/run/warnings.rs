@@ -216,9 +216,10 @@ impl RunMonitor {
 
 /// A loss with four decimals; a smaller one with its exponent.
 fn shown(loss: f64) -> String {
-    match loss != 0.0 && loss.abs() < 0.001 {
-        true => format!("{loss:.2e}"),
-        false => format!("{loss:.4}"),
+    if loss != 0.0 && loss.abs() < 0.001 {
+        format!("{loss:.2e}")
+    } else {
+        format!("{loss:.4}")
     }
 }
 

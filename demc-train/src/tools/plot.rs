@@ -94,9 +94,10 @@ fn log(path: &Path) -> anyhow::Result<(Vec<LoggedValues>, Option<String>)> {
 
 /// Training loss, and validation RelMSE and SSIM if a run has any.
 fn panels(runs: &[(&String, &Vec<LoggedValues>)], options: &PlotOptions) -> Vec<LinePanel> {
-    let scale = match options.linear {
-        true => AxisScale::Linear,
-        false => AxisScale::Log,
+    let scale = if options.linear {
+        AxisScale::Linear
+    } else {
+        AxisScale::Log
     };
     let mut losses = Vec::new();
     for (color, (name, lines)) in runs.iter().enumerate() {

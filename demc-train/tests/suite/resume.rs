@@ -77,9 +77,12 @@ fn missing_and_damaged_files_cost_at_most_one_checkpoint() {
         let bytes = fs::read(path).expect("a file");
         fs::write(path, &bytes[..bytes.len() / 2]).expect("a file");
     };
-    let remove = |path: &Path| match path.is_dir() {
-        true => fs::remove_dir_all(path).expect("a directory"),
-        false => fs::remove_file(path).expect("a file"),
+    let remove = |path: &Path| {
+        if path.is_dir() {
+            fs::remove_dir_all(path).expect("a directory")
+        } else {
+            fs::remove_file(path).expect("a file")
+        }
     };
     let model = format!("{last}/model.safetensors");
     let optimizer = format!("{last}/optimizer.safetensors");

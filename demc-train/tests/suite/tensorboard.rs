@@ -122,11 +122,12 @@ fn python_with_tensorboard() -> Result<String, String> {
         .map_err(|error| format!("{python} does not run: {error}"))?;
     let stderr = String::from_utf8_lossy(&output.stderr);
     let last = stderr.lines().last().unwrap_or_default();
-    match output.status.success() {
-        true => Ok(python),
-        false => Err(format!(
+    if output.status.success() {
+        Ok(python)
+    } else {
+        Err(format!(
             "{python} cannot import tensorboard (pip install tensorboard): {last}"
-        )),
+        ))
     }
 }
 

@@ -48,11 +48,12 @@ impl Python {
             .map_err(|e| format!("{program} does not run: {e}"))?;
         let stderr = String::from_utf8_lossy(&output.stderr);
         let last = stderr.lines().last().unwrap_or_default();
-        match output.status.success() {
-            true => Ok(()),
-            false => Err(format!(
+        if output.status.success() {
+            Ok(())
+        } else {
+            Err(format!(
                 "{program} cannot import {packages} (pip install {install}): {last}"
-            )),
+            ))
         }
     }
 
@@ -95,9 +96,10 @@ pub fn random_bundle(
         reading,
         width: WIDTH,
         // The paper's levels or others.
-        levels: match rng.random() {
-            true => LEVEL_WIDTHS,
-            false => [2, 1, 3, 2, 4],
+        levels: if rng.random() {
+            LEVEL_WIDTHS
+        } else {
+            [2, 1, 3, 2, 4]
         },
         // Each head with and without a fusion, in both readings.
         head: match (variant, reading) {

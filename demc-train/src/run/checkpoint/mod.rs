@@ -210,9 +210,10 @@ pub fn load(dir: &Path, config: &Config, device: &Device) -> anyhow::Result<Chec
     );
     let plain = device.clone().without_autodiff();
     let average = dir.join(AVERAGE);
-    let average = match average.exists() {
-        true => Some(Bundle::load(&average, &plain)?.model),
-        false => None,
+    let average = if average.exists() {
+        Some(Bundle::load(&average, &plain)?.model)
+    } else {
+        None
     };
     let path = dir.join(OPTIMIZER);
     let bytes = fs::read(&path).with_context(|| path.display().to_string())?;

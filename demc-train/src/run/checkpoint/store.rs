@@ -238,9 +238,10 @@ fn verify(dir: &Path) -> anyhow::Result<()> {
 }
 
 fn remove(dir: &Path) -> anyhow::Result<()> {
-    match dir.exists() {
-        true => fs::remove_dir_all(dir).with_context(|| dir.display().to_string()),
-        false => Ok(()),
+    if dir.exists() {
+        fs::remove_dir_all(dir).with_context(|| dir.display().to_string())
+    } else {
+        Ok(())
     }
 }
 

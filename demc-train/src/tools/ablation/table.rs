@@ -81,17 +81,16 @@ pub(super) fn markdown(comparison: &Comparison) -> String {
     if seeds.len() == 1 {
         text.push_str("- One seed: the intervals do not include the variation between seeds.\n");
     }
-    match differences.is_empty() {
-        true => text.push_str(
+    if differences.is_empty() {
+        text.push_str(
             "- All variants trained on the same batches in the same order; they differ only in the network.\n",
-        ),
-        false => {
-            let _ = writeln!(
-                text,
-                "- **Not only the network differs:** {}.",
-                differences.join("; ")
-            );
-        }
+        )
+    } else {
+        let _ = writeln!(
+            text,
+            "- **Not only the network differs:** {}.",
+            differences.join("; ")
+        );
     }
     text
 }
@@ -99,9 +98,10 @@ pub(super) fn markdown(comparison: &Comparison) -> String {
 /// ` (+0.3 %)` after a parameter count that differs from that of the first variant.
 fn excess(row: &VariantScores, first: &VariantScores) -> String {
     let excess = row.parameters as f64 / first.parameters as f64 - 1.0;
-    match row.parameters == first.parameters {
-        true => String::new(),
-        false => format!(" ({:+.1} %)", 100.0 * excess),
+    if row.parameters == first.parameters {
+        String::new()
+    } else {
+        format!(" ({:+.1} %)", 100.0 * excess)
     }
 }
 

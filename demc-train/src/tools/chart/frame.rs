@@ -35,9 +35,10 @@ pub(super) type LegendEntries = Vec<(String, usize)>;
 
 pub(super) fn palette(color: usize) -> RGBColor {
     let [_, red, green, blue] = PALETTE[color % PALETTE.len()].to_be_bytes();
-    match color < PALETTE.len() {
-        true => RGBColor(red, green, blue),
-        false => RGBColor(red / 2 + 0x40, green / 2 + 0x40, blue / 2 + 0x40),
+    if color < PALETTE.len() {
+        RGBColor(red, green, blue)
+    } else {
+        RGBColor(red / 2 + 0x40, green / 2 + 0x40, blue / 2 + 0x40)
     }
 }
 

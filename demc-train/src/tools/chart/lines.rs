@@ -57,9 +57,10 @@ fn draw_run<B: DrawingBackend>(
 ) -> DrawResult<(), B> {
     let RGBColor(red, green, blue) = palette(series.color);
     let pale = |x: u8| (255.0 - FAINT * (255.0 - f64::from(x))).round() as u8;
-    let (color, width) = match series.faint {
-        true => (RGBColor(pale(red), pale(green), pale(blue)), WIDTHS[1]),
-        false => (RGBColor(red, green, blue), WIDTHS[0]),
+    let (color, width) = if series.faint {
+        (RGBColor(pale(red), pale(green), pale(blue)), WIDTHS[1])
+    } else {
+        (RGBColor(red, green, blue), WIDTHS[0])
     };
     let style = color.filled().stroke_width(width);
     let dots = run.len() == 1 || (series.points.len() <= FEW && !series.faint);
@@ -84,9 +85,10 @@ fn draw_marks<B: DrawingBackend>(
     }
     for (row, (value, label)) in (0..).zip(marks) {
         let (top, width, y) = ((*value, heights.end), frame::width(label) + 16, row * ROW);
-        let (side, from, to) = match chart.backend_coord(&top).0 + width < right {
-            true => (HPos::Left, 8, width),
-            false => (HPos::Right, -8, -width),
+        let (side, from, to) = if chart.backend_coord(&top).0 + width < right {
+            (HPos::Left, 8, width)
+        } else {
+            (HPos::Right, -8, -width)
         };
         let behind = Rectangle::new([(from / 2, y + 2), (to, y + ROW)], WHITE.filled());
         let style = text_style(INK).pos(Pos::new(side, VPos::Center));

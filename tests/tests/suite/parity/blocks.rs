@@ -204,13 +204,14 @@ fn check(fixture: &Fixture, reading: Reading, path: &str, forward: BlockForward)
         "{prefix}: every parameter has a gradient, and nothing else"
     );
     for (name, expected) in &expected {
-        let tolerance = match is_bias_before_norm(name, reading) {
+        let tolerance = if is_bias_before_norm(name, reading) {
             // Zero by construction: gradients of the other parameters are of order 1 to 1000.
-            true => Tolerance {
+            Tolerance {
                 absolute: 1e-3,
                 ..GRADIENT
-            },
-            false => GRADIENT,
+            }
+        } else {
+            GRADIENT
         };
         worst = worst.max(assert_close(
             &format!("{prefix} gradient of {name}"),

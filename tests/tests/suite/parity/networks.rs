@@ -205,14 +205,15 @@ fn check_first_step(
     );
     let mut worst = 0.0f32;
     for (name, expected_values) in &expected {
-        let tolerance = match is_bias_before_norm(name, reading) {
+        let tolerance = if is_bias_before_norm(name, reading) {
             // Zero by construction: the same share of the largest gradient of the convolution's
             // weights.
-            true => Tolerance {
+            Tolerance {
                 absolute: GRADIENT.of_largest * largest(&expected[&name.replace("bias", "weight")]),
                 ..GRADIENT
-            },
-            false => GRADIENT,
+            }
+        } else {
+            GRADIENT
         };
         worst = worst.max(assert_close(
             &format!("gradient of {name}"),
