@@ -48,5 +48,5 @@ pub use training::batch::{Batch, PatchSource};
 pub use training::config::DataConfig;
 pub use training::dropout::Dropout;
 pub use training::loader::BatchLoader;
-pub use training::patch::{Border, Patch};
+pub use training::patch::Patch;
 pub use training::stats::Statistics;

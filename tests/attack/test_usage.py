@@ -6,11 +6,10 @@ from common import LONG, Attack
 
 INTEGERS = ["model.width", "data.patch_size", "data.stride", "data.batch_size", "data.cache_mib", "data.workers",
             "optimizer.warmup_steps", "optimizer.muon_max_rows", "train.steps", "train.seed",
-            "train.grad_accumulation", "run.log_every", "run.validate_every", "run.checkpoint_every", "run.keep",
-            "run.keep_every"]
+            "train.grad_accumulation", "run.log_every", "run.validate_every", "run.checkpoint_every", "run.keep"]
 REALS = ["data.gamma", "data.albedo_demodulation_epsilon", "data.exposure_level", "data.validation", "loss.relmse",
          "loss.dssim", "loss.smape", "loss.l1", "loss.relmse_epsilon", "optimizer.lr_start", "optimizer.lr_end",
-         "optimizer.adam_epsilon", "optimizer.max_grad_norm", "train.ema_decay", "run.checkpoint_minutes"]
+         "optimizer.max_grad_norm", "train.ema_decay", "run.checkpoint_minutes"]
 EXTREMES = {"integer": ["0", "1", "-1", "4294967296", "9007199254740993", "9223372036854775807", "1000000000"],
             "real": ["0.0", "-0.0", "-1.0", "1e-300", "5e-324", "4e17", "1e30", "1e300", "inf", "-inf", "nan",
                      "525600.0", "1e-9", "0.999999999999"]}

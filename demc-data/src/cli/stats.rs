@@ -62,7 +62,7 @@ struct SplitContents {
     scenes: usize,
     base_scenes: BTreeSet<String>,
     sizes: BTreeMap<String, usize>,
-    /// Number of patches of the default size, stride and border; none if a scene is too small for a
+    /// Number of patches of the default size and stride; none if a scene is too small for a
     /// patch.
     patches: Option<usize>,
 }
@@ -143,7 +143,7 @@ fn contents(scenes: &[Scene], config: &DataConfig) -> SplitContents {
         scenes: scenes.len(),
         base_scenes: scenes.iter().map(|scene| scene.base.clone()).collect(),
         sizes,
-        patches: patches(scenes, config.patch_size, config.stride, config.border)
+        patches: patches(scenes, config.patch_size, config.stride)
             .ok()
             .map(|patches| patches.len()),
     }

@@ -110,7 +110,7 @@ impl PatchSource {
             });
         }
         assert!(!scenes.is_empty(), "training needs at least one scene");
-        let patches = patches(&scenes, config.patch_size, config.stride, config.border)?;
+        let patches = patches(&scenes, config.patch_size, config.stride)?;
         Ok(Self {
             cache: SceneCache::new(
                 scenes,

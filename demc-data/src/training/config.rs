@@ -8,7 +8,6 @@ use crate::input::position::PositionSpace;
 use crate::input::preparation::Preparation;
 use crate::training::augment::Augment;
 use crate::training::dropout::Dropout;
-use crate::training::patch::Border;
 
 /// The committed sample data, so that every configuration runs without an edit.
 const ROOT: &str = "data/sample";
@@ -18,8 +17,6 @@ const LAYOUT: &str = "demc-exr";
 const PATCH_SIZE: usize = 128;
 /// "... and stride as 80" (Sec. 4.2).
 const STRIDE: usize = 80;
-/// Ours: the paper is silent; every pixel is trained on.
-const BORDER: Border = Border::Shift;
 /// Eq. 4.
 const GAMMA: f32 = 2.2;
 /// Ours: the paper gives none; 64 fits its schedule, time and memory.
@@ -61,8 +58,6 @@ pub struct DataConfig {
     pub patch_size: usize,
     /// Distance between patches in pixels.
     pub stride: usize,
-    /// `"shift"`: adds a last row and column of patches at the edge; `"drop"`: adds none.
-    pub border: Border,
     /// The transfer function's exponent is `1 / gamma` (Eq. 4); from 1 to 6.
     pub gamma: f32,
     /// Albedo demodulation divides the input colour by (albedo + epsilon) and multiplies the output
@@ -103,7 +98,6 @@ impl Default for DataConfig {
             layout: LAYOUT.to_owned(),
             patch_size: PATCH_SIZE,
             stride: STRIDE,
-            border: BORDER,
             gamma: GAMMA,
             albedo_demodulation_epsilon: None,
             position: PositionSpace::Scene,
@@ -269,9 +263,9 @@ mod tests {
     fn unknown_keys_are_refused_and_known_ones_survive() {
         assert!(toml::from_str::<DataConfig>("patchsize = 64").is_err());
         assert!(toml::from_str::<DataConfig>("demodulate = 0.07").is_err());
-        let text = "albedo_demodulation_epsilon = 0.07\nroot = \"x\"\nborder = \"drop\"\naugment = [\"flip\"]\nvalidation = 0.0";
+        let text = "albedo_demodulation_epsilon = 0.07\nroot = \"x\"\nstride = 40\naugment = [\"flip\"]\nvalidation = 0.0";
         let config: DataConfig = toml::from_str(text).expect("known keys");
-        assert_eq!(config.border, Border::Drop);
+        assert_eq!(config.stride, 40);
         assert_eq!(config.albedo_demodulation_epsilon, Some(0.07));
         let written = toml::to_string(&config).expect("plain data");
         assert_eq!(

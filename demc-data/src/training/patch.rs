@@ -21,34 +21,20 @@ pub struct Patch {
     pub x: u32,
 }
 
-/// Handling of the right and lower edge, where the grid leaves pixels over (ours: the paper is
-/// silent).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Border {
-    /// Adds a last column and row of patches, moved to the edge, so that every pixel is in a patch.
-    Shift,
-    /// Leaves these pixels out.
-    Drop,
-}
-
 /// All patches of `scenes`: scene by scene, row by row, and those of a scene as often as it repeats.
+/// Where the grid leaves pixels over, a last column and row of patches at the edge covers them (ours: the
+/// paper is silent).
 ///
 /// # Errors
 /// [`Error::SceneTooSmall`], naming the first scene that holds no patch.
 ///
 /// # Panics
 /// If `size` or `stride` is 0.
-pub fn patches(
-    scenes: &[Scene],
-    size: usize,
-    stride: usize,
-    border: Border,
-) -> Result<Vec<Patch>, Error> {
+pub fn patches(scenes: &[Scene], size: usize, stride: usize) -> Result<Vec<Patch>, Error> {
     let mut patches = Vec::new();
     for (index, scene) in scenes.iter().enumerate() {
-        let rows = origins(scene.height, size, stride, border);
-        let columns = origins(scene.width, size, stride, border);
+        let rows = origins(scene.height, size, stride);
+        let columns = origins(scene.width, size, stride);
         if rows.is_empty() || columns.is_empty() {
             let (width, height) = (scene.width, scene.height);
             return Err(Error::SceneTooSmall {
@@ -72,7 +58,7 @@ pub fn patches(
 }
 
 /// Start positions of patches of `size` along an edge of `length` pixels; empty if no patch fits.
-fn origins(length: usize, size: usize, stride: usize, border: Border) -> Vec<u32> {
+fn origins(length: usize, size: usize, stride: usize) -> Vec<u32> {
     assert!(
         size > 0 && stride > 0,
         "patch size {size} and stride {stride} must be positive"
@@ -84,7 +70,7 @@ fn origins(length: usize, size: usize, stride: usize, border: Border) -> Vec<u32
         .step_by(stride)
         .map(|origin| origin as u32)
         .collect();
-    if border == Border::Shift && last % stride != 0 {
+    if last % stride != 0 {
         origins.push(last as u32);
     }
     origins
@@ -152,22 +138,21 @@ mod tests {
     }
 
     #[test]
-    fn shift_reaches_the_edge_and_drop_does_not() {
-        assert_eq!(origins(300, 128, 80, Border::Drop), [0, 80, 160]);
-        assert_eq!(origins(300, 128, 80, Border::Shift), [0, 80, 160, 172]);
+    fn the_last_patch_reaches_the_edge() {
+        assert_eq!(origins(300, 128, 80), [0, 80, 160, 172]);
     }
 
     #[test]
     fn a_grid_that_fits_exactly_is_not_doubled_at_the_edge() {
-        assert_eq!(origins(288, 128, 80, Border::Shift), [0, 80, 160]);
-        assert_eq!(origins(128, 128, 80, Border::Shift), [0]);
+        assert_eq!(origins(288, 128, 80), [0, 80, 160]);
+        assert_eq!(origins(128, 128, 80), [0]);
     }
 
     #[test]
-    fn shifted_patches_cover_every_pixel() {
+    fn patches_cover_every_pixel() {
         for length in 128..420 {
             let mut covered = vec![false; length];
-            for origin in origins(length, 128, 80, Border::Shift) {
+            for origin in origins(length, 128, 80) {
                 covered[origin as usize..][..128].fill(true);
             }
             assert!(covered.into_iter().all(|pixel| pixel), "length {length}");
@@ -176,8 +161,7 @@ mod tests {
 
     #[test]
     fn a_hd_scene_has_16_by_9_patches() {
-        let patches =
-            patches(&[scene("a", 1280, 720)], 128, 80, Border::Shift).expect("large enough");
+        let patches = patches(&[scene("a", 1280, 720)], 128, 80).expect("large enough");
         assert_eq!(patches.len(), 16 * 9);
         assert_eq!(
             patches[143],
@@ -193,7 +177,7 @@ mod tests {
     fn a_repeated_scene_has_its_patches_as_often() {
         let mut scenes = [scene("few", 256, 128), scene("many", 128, 128)];
         scenes[1].repeat = NonZero::new(3).expect("not 0");
-        let patches = patches(&scenes, 128, 128, Border::Drop).expect("large enough");
+        let patches = patches(&scenes, 128, 128).expect("large enough");
         let scenes: Vec<u32> = patches.iter().map(|patch| patch.scene).collect();
         assert_eq!(scenes, [0, 0, 1, 1, 1]);
         assert!(patches[2..].iter().all(|patch| *patch == patches[2]));
@@ -202,7 +186,7 @@ mod tests {
     #[test]
     fn a_scene_smaller_than_a_patch_is_named() {
         let scenes = [scene("large", 200, 200), scene("narrow", 127, 500)];
-        let error = patches(&scenes, 128, 80, Border::Shift)
+        let error = patches(&scenes, 128, 80)
             .expect_err("too small")
             .to_string();
         assert_eq!(

@@ -9,8 +9,8 @@ use crate::support::{identity, layout, scene_channels, write};
 use demc_data::image::frame::TEXTURES;
 use demc_data::training::cache::{AlbedoFilter, SceneCache};
 use demc_data::{
-    Augment, Batch, BatchLoader, Border, DataConfig, Error, FEATURES, Frame, Normalizer,
-    PatchSource, Scene, Statistics, read_frame,
+    Augment, Batch, BatchLoader, DataConfig, Error, FEATURES, Frame, Normalizer, PatchSource,
+    Scene, Statistics, read_frame,
 };
 use demc_data::{PositionSpace, Preparation};
 
@@ -319,7 +319,6 @@ fn dropping_a_loader_ends_its_threads() {
 fn scenes_smaller_than_a_patch_and_layouts_without_reference_are_refused() {
     let config = DataConfig {
         patch_size: 256,
-        border: Border::Drop,
         ..small()
     };
     let error = PatchSource::new(&config, train_scenes(), layout(), identity(), 1)

@@ -6,7 +6,6 @@
 //! relative to the current directory. The resolved configuration, saved with the run, holds
 //! absolute paths.
 
-mod first_edition;
 mod optimizer;
 mod problems;
 mod run;

@@ -15,8 +15,6 @@ const LR_END: f64 = 5e-6;
 const RATES: RangeInclusive<f64> = 1e-30..=10.0;
 /// Largest weight decay. Ours: at learning rates up to 0.1 it never removes more than a kernel.
 const MAX_DECAY: f64 = 10.0;
-/// Adam's epsilon (Kingma and Ba 2014).
-const ADAM_EPSILON: f32 = 1e-8;
 /// Largest matrix for Muon, in rows. Ours: every kernel of the level widths that this project
 /// trains.
 const MUON_MAX_ROWS: usize = 128;
@@ -53,8 +51,6 @@ pub struct OptimizerConfig {
     pub lr_decay: LrDecay,
     /// Steps at the beginning over which the learning rate rises linearly. Paper: none.
     pub warmup_steps: u64,
-    /// Epsilon of Adam.
-    pub adam_epsilon: f32,
     /// Largest norm of the whole gradient; a longer gradient is scaled down. Absent: no clipping,
     /// as in the paper.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -72,7 +68,6 @@ impl Default for OptimizerConfig {
             lr_end: LR_END,
             lr_decay: LrDecay::Exponential,
             warmup_steps: 0,
-            adam_epsilon: ADAM_EPSILON,
             max_grad_norm: None,
         }
     }
@@ -94,7 +89,6 @@ impl OptimizerConfig {
             &decay,
             &format!("from 0 to {MAX_DECAY}"),
         );
-        problems.require_positive("adam_epsilon", self.adam_epsilon.into());
         if let Some(norm) = self.max_grad_norm {
             let holds = norm.is_finite() && norm > 0.0;
             let allowed = "a positive number, or absent for no clipping";

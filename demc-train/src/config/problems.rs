@@ -29,12 +29,6 @@ impl TableProblems {
         }
     }
 
-    /// Requires a positive, finite number.
-    pub(super) fn require_positive(&mut self, key: &str, value: f64) {
-        let holds = value.is_finite() && value > 0.0;
-        self.require(holds, key, &value, "a positive number");
-    }
-
     /// Requires an integer from 1 to `most`.
     pub(super) fn require_count(&mut self, key: &str, value: u64, most: u64) {
         let holds = (1..=most).contains(&value);

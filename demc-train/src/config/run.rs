@@ -38,9 +38,6 @@ pub struct RunConfig {
     pub checkpoint_minutes: f64,
     /// Number of newest checkpoints kept. The best weights are kept apart from them.
     pub keep: usize,
-    /// Checkpoints whose step is a multiple of this are kept forever. Absent: none.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub keep_every: Option<u64>,
 }
 
 impl Default for RunConfig {
@@ -52,7 +49,6 @@ impl Default for RunConfig {
             checkpoint_every: CHECKPOINT_EVERY,
             checkpoint_minutes: CHECKPOINT_MINUTES,
             keep: KEEP,
-            keep_every: None,
         }
     }
 }
@@ -68,11 +64,6 @@ impl RunConfig {
             ("keep", self.keep as u64),
         ] {
             problems.require_count(key, value, MAX_STEPS);
-        }
-        if let Some(steps) = self.keep_every {
-            let holds = (1..=MAX_STEPS).contains(&steps);
-            let allowed = format!("from 1 to {MAX_STEPS}, or absent for none");
-            problems.require(holds, "keep_every", &steps, &allowed);
         }
         let minutes = self.checkpoint_minutes;
         problems.require(

@@ -9,8 +9,6 @@ use serde::forward_to_deserialize_any;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-use super::first_edition;
-
 /// Smallest similarity (Jaro-Winkler, 0 to 1) of a suggested key; ours.
 const MIN_SIMILARITY: f64 = 0.75;
 
@@ -122,12 +120,11 @@ fn check_keys(
             format!("{prefix}.{}", key.get_ref())
         };
         let is_table = keys.iter().any(|k| k.starts_with(&format!("{path}.")));
-        let is_boolean = matches!(value.get_ref(), DeValue::Boolean(_));
         match value.get_ref() {
             DeValue::Table(inner) if is_table => check_keys(inner, &path, keys, report),
             _ if is_table => {}
             _ => {
-                if let Err(problem) = check_key(&path, is_boolean, keys) {
+                if let Err(problem) = check_key(&path, keys) {
                     report(key.span().start, problem);
                 }
             }
@@ -135,24 +132,23 @@ fn check_keys(
     }
 }
 
-fn check_key(path: &str, is_boolean: bool, keys: &BTreeSet<String>) -> Result<(), String> {
-    if let Some(refusal) = first_edition::refusal(path, is_boolean) {
-        return Err(refusal);
+fn check_key(path: &str, keys: &BTreeSet<String>) -> Result<(), String> {
+    if keys.contains(path) {
+        return Ok(());
     }
-    match keys.contains(path) {
-        true => Ok(()),
-        false if tables(keys).contains(path) => {
-            let prefix = format!("{path}.");
-            let keys: Vec<&String> = keys.iter().filter(|key| key.starts_with(&prefix)).collect();
-            let keys = keys
-                .iter()
-                .map(|key| key.as_str())
-                .collect::<Vec<_>>()
-                .join(", ");
-            Err(format!("`{path}` is a table; set one of its keys: {keys}"))
-        }
-        false => Err(format!("unknown key `{path}`{}", suggestion(path, keys))),
+    if !tables(keys).contains(path) {
+        return Err(format!("unknown key `{path}`{}", suggestion(path, keys)));
     }
+    let prefix = format!("{path}.");
+    let inside: Vec<&str> = keys
+        .iter()
+        .filter(|key| key.starts_with(&prefix))
+        .map(String::as_str)
+        .collect();
+    let inside = inside.join(", ");
+    Err(format!(
+        "`{path}` is a table; set one of its keys: {inside}"
+    ))
 }
 
 fn tables(keys: &BTreeSet<String>) -> BTreeSet<&str> {
@@ -229,7 +225,7 @@ fn edit<'a>(set: &'a str, keys: &BTreeSet<String>) -> Result<Edit<'a>, String> {
     } else {
         Some(text.parse().unwrap_or_else(|_| Value::String(text.into())))
     };
-    check_key(path, matches!(value, Some(Value::Boolean(_))), keys)?;
+    check_key(path, keys)?;
     let (table, key) = path
         .split_once('.')
         .expect("every known key belongs to a table");

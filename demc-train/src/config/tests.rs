@@ -135,40 +135,6 @@ fn bad_sets_are_named() {
 }
 
 #[test]
-fn keys_of_the_first_edition_are_refused_with_their_replacement() {
-    let text =
-        "[data]\ndemodulate = 0.07\naugment = true\n[train]\nsteps = 9\nmuon = 64\nlr_fan_in = 0\n";
-    let error = parsed(
-        text,
-        &["train.ema=0.9", "data.augment=false", "train.steps=3"],
-    )
-    .unwrap_err();
-    for words in [
-        "run.toml:2: first-edition key `data.demodulate`: write data.albedo_demodulation_epsilon",
-        "run.toml:3: first-edition value of `data.augment`: write a list",
-        "run.toml:6: first-edition key `train.muon`: write optimizer.kind = \"muon\" and",
-        "run.toml:7: first-edition key `train.lr_fan_in`: delete it",
-        "--set train.ema=0.9: first-edition key `train.ema`: write train.ema_decay",
-        "--set data.augment=false: first-edition value",
-    ] {
-        assert!(error.contains(words), "{words}: {error}");
-    }
-    assert_eq!(error.matches("first-edition").count(), 6, "{error}");
-}
-
-#[test]
-fn replacements_of_the_first_edition_exist_and_its_keys_do_not() {
-    let keys = Config::keys();
-    for (old, advice) in first_edition::REPLACEMENTS {
-        assert!(!keys.contains(old), "{old}");
-        let named = advice.split([' ', ',']).filter(|word| word.contains('.'));
-        for key in named.filter(|word| !word.ends_with(".py")) {
-            assert!(keys.contains(key), "{key}");
-        }
-    }
-}
-
-#[test]
 fn a_key_with_line_breaks_does_not_break_the_message() {
     let error = parsed("[train]\n\"a\\nb\\u001b[2J\" = 1", &[]).unwrap_err();
     assert!(

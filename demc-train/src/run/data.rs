@@ -121,7 +121,6 @@ impl RunData {
             validation,
             patch_size,
             stride,
-            border,
             ..
         } = &config.data;
         let layout = ChannelLayout::resolve(layout)?;
@@ -134,7 +133,7 @@ impl RunData {
             .collect();
         let all: Vec<Scene> = train.iter().chain(&validation).cloned().collect();
         // Validation scenes too: another seed may train on them.
-        demc_data::training::patch::patches(&all, *patch_size, *stride, *border)?;
+        demc_data::training::patch::patches(&all, *patch_size, *stride)?;
         let statistics =
             Statistics::measure(&train, &layout, &config.data, config.loss.relmse_epsilon)
                 .context("measuring the training scenes")?;

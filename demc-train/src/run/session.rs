@@ -332,7 +332,7 @@ fn latest_checkpoint(
     notes.push(format!("resuming from {}", intact.display()));
     if restore {
         notes.extend(checkpoint::restore_run(run, &intact)?);
-        CheckpointStore::new(run).remove_old(&intact, checkpoint::retention(config))?;
+        CheckpointStore::new(run).remove_old(&intact, config.run.keep)?;
     }
     Ok(Some((intact, checkpoint)))
 }

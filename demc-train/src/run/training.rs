@@ -341,7 +341,7 @@ impl TrainingRun {
             average.as_ref(),
             self.trainer.optimizer(),
             &self.state,
-            checkpoint::retention(&self.config),
+            self.config.run.keep,
         )
     }
 

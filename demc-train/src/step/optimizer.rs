@@ -19,6 +19,8 @@ use crate::config::Config;
 const BETA_1: f32 = 0.9;
 /// Decay of the second moment (Kingma and Ba's default).
 const BETA_2: f32 = 0.999;
+/// Keeps the division finite (Kingma and Ba 2014).
+const EPSILON: f32 = 1e-8;
 /// Steps without a gradient after which a channel is dormant.
 pub const DORMANT_STEPS: u64 = 175;
 /// A channel is dormant if its bias's first moment is at most this share of the root of the second.
@@ -90,7 +92,7 @@ impl Optimizer {
         let constants = AdamConstants {
             beta_1: BETA_1,
             beta_2: BETA_2,
-            epsilon: config.optimizer.adam_epsilon,
+            epsilon: EPSILON,
         };
         Optimizer {
             constants,

@@ -10,10 +10,6 @@ pub enum LrDecay {
     Exponential,
     /// Half a cosine.
     Cosine,
-    /// The same amount each step.
-    Linear,
-    /// The start's value throughout.
-    Constant,
 }
 
 /// The learning rate over a run.
@@ -46,8 +42,6 @@ impl LearningRate {
                 LrDecay::Cosine => {
                     end + (start - end) * 0.5 * (1.0 + (std::f64::consts::PI * done).cos())
                 }
-                LrDecay::Linear => start + (end - start) * done,
-                LrDecay::Constant => start,
             }
     }
 }
@@ -80,24 +74,18 @@ mod tests {
 
     #[test]
     fn every_decay_starts_at_the_start() {
-        for decay in [
-            LrDecay::Exponential,
-            LrDecay::Cosine,
-            LrDecay::Linear,
-            LrDecay::Constant,
-        ] {
+        for decay in [LrDecay::Exponential, LrDecay::Cosine] {
             assert_eq!(rate(decay).at(0), 1e-4);
         }
     }
 
     #[test]
-    fn every_decay_except_constant_falls_to_the_end() {
-        for decay in [LrDecay::Exponential, LrDecay::Cosine, LrDecay::Linear] {
+    fn every_decay_falls_to_the_end() {
+        for decay in [LrDecay::Exponential, LrDecay::Cosine] {
             let rate = rate(decay);
             assert!((rate.at(1000) - 5e-6).abs() < 1e-18);
             assert!((0..1000).all(|step| rate.at(step + 1) < rate.at(step)));
         }
-        assert_eq!(rate(LrDecay::Constant).at(1000), 1e-4);
     }
 
     #[test]

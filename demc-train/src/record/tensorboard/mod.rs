@@ -14,7 +14,7 @@
 //!   its next value.
 //! - `event_accumulator.py` never drops text.
 //!
-//! `tests/tensorboard.rs` reads these files with the `tensorboard` package.
+//! `tests/suite/tensorboard.rs` reads these files with the `tensorboard` package.
 
 mod proto;
 mod record;

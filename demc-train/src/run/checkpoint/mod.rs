@@ -33,7 +33,7 @@ use crate::config::Config;
 use crate::run::run_dir::{OWN_FILES, is_usable};
 use crate::run::warnings::RunMonitor;
 use crate::step::optimizer::Optimizer;
-use store::{CheckpointRetention, CheckpointStore};
+use store::CheckpointStore;
 
 /// Version of a checkpoint's files; raised when a meaning changes.
 pub const FORMAT: u32 = 2;
@@ -165,7 +165,7 @@ pub fn save(
     average: Option<&Bundle>,
     optimizer: &Optimizer,
     state: &LoopState,
-    retention: CheckpointRetention,
+    keep: usize,
 ) -> anyhow::Result<()> {
     let bytes = |bundle: &Bundle| bundle.to_bytes(Names::Burn, Precision::F32);
     let mut files = vec![
@@ -183,15 +183,7 @@ pub fn save(
     }
     let best = run.join(BEST);
     let linked = state.best.map(|_| (BEST, &*best));
-    CheckpointStore::new(run).write(state.step, &files, linked, retention)
-}
-
-/// Which checkpoints a run of `config` keeps.
-pub fn retention(config: &Config) -> CheckpointRetention {
-    CheckpointRetention {
-        newest: config.run.keep,
-        every: config.run.keep_every,
-    }
+    CheckpointStore::new(run).write(state.step, &files, linked, keep)
 }
 
 /// Reads a checkpoint onto `device`.

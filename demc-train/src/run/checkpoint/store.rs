@@ -19,15 +19,6 @@ use demc_program::file::{sync_dir, write_whole};
 /// Suffix of an unfinished checkpoint.
 const UNFINISHED: &str = ".tmp";
 
-/// Which checkpoints are kept.
-#[derive(Clone, Copy, Debug)]
-pub struct CheckpointRetention {
-    /// Number of newest checkpoints.
-    pub newest: usize,
-    /// Checkpoints whose step is a multiple of this are kept forever.
-    pub every: Option<u64>,
-}
-
 /// The checkpoints of a run.
 #[derive(Clone, Debug)]
 pub struct CheckpointStore {
@@ -54,7 +45,7 @@ impl CheckpointStore {
     }
 
     /// Writes a checkpoint of `step` with `files` and, under a new name, the existing file
-    /// `linked`. Then updates `latest` and removes the checkpoints that `retention` does not keep.
+    /// `linked`. Then updates `latest` and removes all but the `keep` newest checkpoints.
     ///
     /// # Errors
     /// A file that cannot be written, with the last intact checkpoint. Earlier checkpoints stay.
@@ -63,7 +54,7 @@ impl CheckpointStore {
         step: u64,
         files: &[(&str, Vec<u8>)],
         linked: Option<(&str, &Path)>,
-        retention: CheckpointRetention,
+        keep: usize,
     ) -> anyhow::Result<()> {
         let name = format!("step-{step:08}");
         let unfinished = self.all().join(format!("{name}{UNFINISHED}"));
@@ -74,7 +65,7 @@ impl CheckpointStore {
             fs::rename(&unfinished, &finished).with_context(|| finished.display().to_string())?;
             sync(&self.all())?;
             write_whole(&self.run.join(LATEST), |file| writeln!(file, "{name}"))?;
-            self.prune(&name, retention)
+            self.prune(&name, keep)
         });
         written.map_err(|error| {
             // The unfinished checkpoint is useless and takes disk space.
@@ -135,18 +126,18 @@ impl CheckpointStore {
         Ok(names.filter(|name| step_of(name).is_some()).collect())
     }
 
-    /// Removes what a killed run left: unfinished checkpoints, and those that `retention` does not
+    /// Removes what a killed run left: unfinished checkpoints, and all but the `keep` newest
     /// keep beside `newest`.
     ///
     /// # Errors
     /// A checkpoint that cannot be removed.
-    pub fn remove_old(&self, newest: &Path, retention: CheckpointRetention) -> anyhow::Result<()> {
+    pub fn remove_old(&self, newest: &Path, keep: usize) -> anyhow::Result<()> {
         let name = newest.file_name().and_then(|name| name.to_str());
-        self.prune(name.unwrap_or_default(), retention)
+        self.prune(name.unwrap_or_default(), keep)
     }
 
-    /// Removes unfinished checkpoints and those that `retention` does not keep, but never `name`.
-    fn prune(&self, name: &str, retention: CheckpointRetention) -> anyhow::Result<()> {
+    /// Removes unfinished checkpoints and all but the `keep` newest, but never `name`.
+    fn prune(&self, name: &str, keep: usize) -> anyhow::Result<()> {
         let all = self.all();
         for entry in names_in(&all)? {
             if entry.strip_suffix(UNFINISHED).and_then(step_of).is_some() {
@@ -160,14 +151,9 @@ impl CheckpointStore {
             .filter_map(|entry| Some((step_of(&entry)?, entry)))
             .collect();
         old.sort();
-        old.truncate((old.len() + 1).saturating_sub(retention.newest));
-        for (step, entry) in old {
-            let kept = retention
-                .every
-                .is_some_and(|every| step.is_multiple_of(every));
-            if !kept {
-                remove(&all.join(entry))?;
-            }
+        old.truncate((old.len() + 1).saturating_sub(keep));
+        for (_, entry) in old {
+            remove(&all.join(entry))?;
         }
         Ok(())
     }
@@ -249,17 +235,12 @@ fn remove(dir: &Path) -> anyhow::Result<()> {
 mod tests {
     use super::*;
 
-    const TWO: CheckpointRetention = CheckpointRetention {
-        newest: 2,
-        every: None,
-    };
-
-    fn run(steps: &[u64], retention: CheckpointRetention) -> (tempfile::TempDir, CheckpointStore) {
+    fn run(steps: &[u64], keep: usize) -> (tempfile::TempDir, CheckpointStore) {
         let dir = tempfile::tempdir().unwrap();
         let store = CheckpointStore::new(dir.path());
         for step in steps {
             let files = [("a file", step.to_string().into_bytes())];
-            store.write(*step, &files, None, retention).unwrap();
+            store.write(*step, &files, None, keep).unwrap();
         }
         (dir, store)
     }
@@ -271,47 +252,40 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_every_mth_and_other_files_are_kept() {
-        let (dir, store) = run(&[1], TWO);
+    fn the_newest_and_other_files_are_kept() {
+        let (dir, store) = run(&[1], 2);
         let all = dir.path().join(CHECKPOINTS);
         for name in ["step-00000003.tmp", "keep-me", "step-1"] {
             fs::create_dir(all.join(name)).unwrap();
         }
         fs::write(all.join("notes.txt"), "mine").unwrap();
-        let retention = CheckpointRetention {
-            newest: 2,
-            every: Some(4),
-        };
         for step in 2..=10 {
-            store.write(step, &[], None, retention).unwrap();
+            store.write(step, &[], None, 2).unwrap();
         }
-        let kept = ["step-00000004", "step-00000008", "step-00000009"];
-        let kept = [&["keep-me", "notes.txt", "step-00000004"][..], &kept[1..]].concat();
-        assert_eq!(
-            remaining(&store),
-            [&kept[..], &["step-00000010", "step-1"]].concat()
-        );
+        let kept = [
+            "keep-me",
+            "notes.txt",
+            "step-00000009",
+            "step-00000010",
+            "step-1",
+        ];
+        assert_eq!(remaining(&store), kept);
         let latest = fs::read_to_string(dir.path().join(LATEST)).unwrap();
         assert_eq!(latest, "step-00000010\n");
     }
 
     #[test]
     fn what_a_killed_run_left_is_removed() {
-        let all = CheckpointRetention {
-            newest: 9,
-            every: None,
-        };
-        let (dir, store) = run(&[1, 2, 3], all);
+        let (dir, store) = run(&[1, 2, 3], 9);
         std::fs::create_dir(dir.path().join("checkpoints/step-00000004.tmp")).unwrap();
-        let two = CheckpointRetention { newest: 2, ..all };
         let newest = dir.path().join("checkpoints/step-00000003");
-        store.remove_old(&newest, two).unwrap();
+        store.remove_old(&newest, 2).unwrap();
         assert_eq!(remaining(&store), ["step-00000002", "step-00000003"]);
     }
 
     #[test]
     fn a_damaged_checkpoint_is_named_and_the_previous_one_used() {
-        let (dir, store) = run(&[5, 6], TWO);
+        let (dir, store) = run(&[5, 6], 2);
         let dir_of = |step: u64| store.all().join(format!("step-{step:08}"));
         assert_eq!(store.newest_intact().unwrap().intact, Some(dir_of(6)));
         fs::write(dir_of(6).join("a file"), "7").unwrap();
@@ -329,7 +303,7 @@ mod tests {
 
     #[test]
     fn latest_decides_and_may_be_missing() {
-        let (dir, store) = run(&[5, 6, 7], TWO);
+        let (dir, store) = run(&[5, 6, 7], 2);
         let latest = dir.path().join(LATEST);
         let newest = |store: &CheckpointStore| {
             let found = store.newest_intact().unwrap();
@@ -353,10 +327,10 @@ mod tests {
 
     #[test]
     fn a_linked_file_outlives_its_original() {
-        let (dir, store) = run(&[1], TWO);
+        let (dir, store) = run(&[1], 2);
         let best = dir.path().join("best");
         fs::write(&best, "weights").unwrap();
-        store.write(2, &[], Some(("kept", &best)), TWO).unwrap();
+        store.write(2, &[], Some(("kept", &best)), 2).unwrap();
         fs::remove_file(&best).unwrap();
         let found = store.newest_intact().unwrap();
         let kept = found.intact.unwrap().join("kept");
@@ -365,7 +339,7 @@ mod tests {
 
     #[test]
     fn checksums_equal_those_of_sha256sum() {
-        let (dir, store) = run(&[7], TWO);
+        let (dir, store) = run(&[7], 2);
         let sums = fs::read_to_string(store.all().join("step-00000007").join(SUMS)).unwrap();
         // printf 7 | sha256sum
         let expected = "7902699be42c8a8e46fbbb4501726517e86b22c56a189f7625a6da49081b2451  a file\n";
@@ -375,9 +349,9 @@ mod tests {
 
     #[test]
     fn a_failed_write_names_the_last_intact_checkpoint() {
-        let (dir, store) = run(&[1], TWO);
+        let (dir, store) = run(&[1], 2);
         let missing = dir.path().join("missing");
-        let error = store.write(2, &[], Some(("kept", &missing)), TWO);
+        let error = store.write(2, &[], Some(("kept", &missing)), 2);
         let error = format!("{:#}", error.unwrap_err());
         assert!(
             error.contains("step 2 (the last intact checkpoint is ")

@@ -3,7 +3,7 @@
 //!
 //! [`AblationSpec`] describes the comparison. [`run`] trains the runs that are not complete, seed
 //! by seed, so that a stopped ablation has complete seeds. [`Comparison`] summarises the scores in
-//! a table and a figure.
+//! a table.
 
 pub mod comparison;
 pub mod spec;
@@ -227,7 +227,7 @@ fn finished(config: &Config) -> anyhow::Result<Option<FinishedRun>> {
     Ok(Some(FinishedRun { report, seconds }))
 }
 
-/// Writes table and figure of a comparison into `dir`; returns the paths.
+/// Writes the tables of a comparison into `dir`; returns the paths.
 ///
 /// # Errors
 /// A file that cannot be written.
