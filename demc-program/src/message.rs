@@ -144,6 +144,19 @@ fn write_lines(text: &str) -> io::Result<()> {
     out.flush()
 }
 
+/// A duration in seconds as `3 days 4 h`, `2 h 5 min`, `3 min 20 s`, `4.2 s`, `250 ms`: at most two units.
+pub fn duration(duration: f64) -> String {
+    let seconds = duration as u64;
+    let (days, hours, minutes) = (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60);
+    match (days, hours, minutes) {
+        (0, 0, 0) if duration < 1.0 => format!("{:.0} ms", 1000.0 * duration),
+        (0, 0, 0) => format!("{duration:.1} s"),
+        (0, 0, _) => format!("{minutes} min {} s", seconds % 60),
+        (0, _, _) => format!("{hours} h {minutes} min"),
+        _ => format!("{days} days {hours} h"),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -168,5 +181,14 @@ mod tests {
         assert_eq!(list(&names(3)), "0, 1, 2");
         assert_eq!(short_list(&names(6)), "0, 1, 2, 3, 4 and 1 more");
         assert!(list(&names(100)).ends_with("18, 19 and 80 more"));
+    }
+
+    #[test]
+    fn durations_have_at_most_two_units() {
+        assert_eq!(duration(0.25), "250 ms");
+        assert_eq!(duration(4.24), "4.2 s");
+        assert_eq!(duration(200.0), "3 min 20 s");
+        assert_eq!(duration(7500.0), "2 h 5 min");
+        assert_eq!(duration(273_700.0), "3 days 4 h");
     }
 }

@@ -5,9 +5,11 @@ use std::path::PathBuf;
 use demc_infer::device;
 use demc_program::message;
 use demc_train::Config;
-use demc_train::ranks::Ranks;
+use demc_train::ranks::Reduce;
 use demc_train::run::observer::TakenStep;
-use demc_train::run::session::{Session, SessionOptions, SessionOutcome, SessionPlace};
+use demc_train::run::place::SessionPlace;
+use demc_train::run::session::{Session, SessionOptions};
+use demc_train::run::signals::Outcome;
 use pyo3::prelude::*;
 
 use crate::error::exception;
@@ -49,7 +51,7 @@ pub fn train(
         let place = SessionPlace {
             device: device::parse("flex")?,
             device_name: "flex".into(),
-            ranks: Ranks::world(),
+            reduce: Reduce::default(),
         };
         let options = SessionOptions {
             resume,
@@ -63,14 +65,14 @@ pub fn train(
             is_last.then_some(INTERRUPT)
         })?;
         let (kept, scores) = match outcome {
-            SessionOutcome::Complete { kept, scores } => (kept, scores),
+            Outcome::Complete(finished) => (finished.kept, finished.scores),
             // The exception that stopped the run takes the place of the result.
-            SessionOutcome::Stopped { .. } => (String::new(), None),
+            Outcome::Stopped(_) => (String::new(), None),
         };
-        let scores = scores.map(|(step, report)| Ok((step, serde_json::to_string(&report)?)));
-        let scores = scores
-            .transpose()
-            .map_err(|error: serde_json::Error| error)?;
+        let scores = match scores {
+            Some(found) => Some((found.step, serde_json::to_string(&found.report)?)),
+            None => None,
+        };
         Ok((dir, kept, scores, warnings, notes))
     };
     let was_silent = message::is_silent();

@@ -11,7 +11,7 @@ use crate::error::Error;
 use crate::seed::{RandomStream, generator};
 
 /// A square of a scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Patch {
     /// Index of the scene in the list that the patches are made from.
     pub scene: u32,

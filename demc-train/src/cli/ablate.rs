@@ -3,13 +3,14 @@
 use std::path::PathBuf;
 
 use crate::config::utf8;
-use crate::ranks::Ranks;
+use crate::ranks::Reduce;
 use crate::record::progress::say;
+use crate::run::signals::Outcome;
+use crate::tools::ablation;
 use crate::tools::ablation::spec::AblationSpec;
-use crate::tools::ablation::{self, AblationOutcome};
 use clap::Args;
 
-use super::compute::{ComputeArguments, stopped};
+use super::compute::{ComputeArguments, report_stop};
 
 /// Train variants with several seeds each and compare them on the test split
 ///
@@ -35,13 +36,13 @@ pub struct Arguments {
 }
 
 /// Trains and compares the variants.
-pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<u8> {
+pub fn run(arguments: Arguments, reduce: &Reduce) -> anyhow::Result<u8> {
     let spec = AblationSpec::load(&arguments.config, &arguments.set);
-    let mut spec = ranks.agree(spec.map_err(Into::into))?;
+    let mut spec = reduce.agree(spec.map_err(Into::into))?;
     if let Some(dir) = arguments.run_dir {
         spec.dir = utf8("--run-dir", &dir)?.into();
     }
-    let place = arguments.compute.place(ranks)?;
+    let place = arguments.compute.place(reduce)?;
     for variant in &spec.variants {
         let model = &variant.config.model;
         say(format!(
@@ -55,11 +56,9 @@ pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<u8> {
         say(format!("note: not only the network differs: {difference}"));
     }
     match ablation::run(&spec, &place)? {
-        AblationOutcome::Stopped { signal, step } => {
-            Ok(stopped(signal, step, "rerun the command to resume"))
-        }
-        AblationOutcome::Done(None) => Ok(0),
-        AblationOutcome::Done(Some(comparison)) => {
+        Outcome::Stopped(stopped) => Ok(report_stop(stopped, "rerun the command to resume")),
+        Outcome::Complete(None) => Ok(0),
+        Outcome::Complete(Some(comparison)) => {
             let paths = ablation::write(&comparison, &spec.dir)?;
             say(format!("\n{}", ablation::markdown(&comparison)));
             for path in paths {

@@ -1,9 +1,9 @@
 //! Arguments of all subcommands that compute, and their exit after a signal.
 
-use crate::ranks::{OnNode, Ranks};
+use crate::ranks::{NodeShare, Reduce};
 use crate::record::progress::say;
-use crate::run::session::SessionPlace;
-use crate::run::signals;
+use crate::run::place::SessionPlace;
+use crate::run::signals::{self, Stopped};
 use burn::tensor::Device;
 use clap::Args;
 use demc_infer::compute::ComputeFlags;
@@ -21,33 +21,33 @@ pub(super) struct ComputeArguments {
 }
 
 impl ComputeArguments {
-    /// The device of this rank, without autodiff. Sets implementation and instruction set for the
+    /// The device of this process, without autodiff. Sets implementation and instruction set for the
     /// process.
-    pub(super) fn place(&self, ranks: &Ranks) -> anyhow::Result<SessionPlace> {
-        let name = device_of_rank(&self.device, ranks.on_node());
+    pub(super) fn place(&self, reduce: &Reduce) -> anyhow::Result<SessionPlace> {
+        let name = device_on_node(&self.device, reduce.on_node());
         let device = || -> anyhow::Result<Device> {
             self.flags.apply()?;
             Ok(device::parse(&name)?)
         };
         Ok(SessionPlace {
-            device: ranks.agree(device())?,
+            device: reduce.agree(device())?,
             device_name: name,
-            ranks: ranks.clone(),
+            reduce: reduce.clone(),
         })
     }
 }
 
-/// The device of a rank: if several ranks of a node share the name of a GPU backend, each gets the
-/// GPU of its number.
-fn device_of_rank(name: &str, on_node: OnNode) -> String {
+/// If several processes of a node share the name of a GPU backend, each gets the GPU of its number.
+fn device_on_node(name: &str, node: NodeShare) -> String {
     match name {
-        "wgpu" | "cuda" if on_node.count > 1 => format!("{name}:{}", on_node.rank),
+        "wgpu" | "cuda" if node.count > 1 => format!("{name}:{}", node.index),
         name => name.to_owned(),
     }
 }
 
 /// Reports that a signal stopped the run after this step, and how to resume. Returns the exit code.
-pub(super) fn stopped(signal: i32, step: u64, how: &str) -> u8 {
+pub(super) fn report_stop(stopped: Stopped, how: &str) -> u8 {
+    let Stopped { signal, step } = stopped;
     say(format!(
         "\n{}: stopped after step {step}, everything is saved; {how}",
         signals::name(signal)
@@ -60,12 +60,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_rank_of_a_node_has_its_own_gpu() {
-        let second = OnNode { rank: 1, count: 4 };
-        assert_eq!(device_of_rank("wgpu", second), "wgpu:1");
-        assert_eq!(device_of_rank("cuda:3", second), "cuda:3");
-        assert_eq!(device_of_rank("flex", second), "flex");
-        let alone = OnNode { rank: 0, count: 1 };
-        assert_eq!(device_of_rank("wgpu", alone), "wgpu");
+    fn each_process_of_a_node_has_its_own_gpu() {
+        let second = NodeShare { index: 1, count: 4 };
+        assert_eq!(device_on_node("wgpu", second), "wgpu:1");
+        assert_eq!(device_on_node("cuda:3", second), "cuda:3");
+        assert_eq!(device_on_node("flex", second), "flex");
+        let alone = NodeShare { index: 0, count: 1 };
+        assert_eq!(device_on_node("wgpu", alone), "wgpu");
     }
 }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::config::Config;
-use crate::ranks::{self, Ranks};
+use crate::ranks::Reduce;
 use crate::record::progress::{StepProgress, say};
 use crate::run::data::{RunData, protect_inputs};
 use crate::tools::chart::with_extension;
@@ -55,7 +55,7 @@ pub struct Arguments {
 }
 
 /// Runs the sweep and prints its suggestion.
-pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<u8> {
+pub fn run(arguments: Arguments, reduce: &Reduce) -> anyhow::Result<u8> {
     let Arguments {
         from, to, steps, ..
     } = arguments;
@@ -76,17 +76,14 @@ pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<u8> {
         .into());
     }
     let config = Config::load(&arguments.config, &arguments.set);
-    let config = ranks.agree(config.map_err(Into::into))?;
+    let config = reduce.agree(config.map_err(Into::into))?;
     let name = arguments.config.file_stem().unwrap_or_default();
     let stem = arguments
         .out
         .unwrap_or_else(|| Path::new("runs/find-lr").join(name));
-    let place = arguments.compute.place(ranks)?;
-    ranks.agree(ranks::check_divides(
-        ranks.count(),
-        config.train.grad_accumulation,
-    ))?;
-    let data = ranks.from_first(|| {
+    let place = arguments.compute.place(reduce)?;
+    reduce.check(&config.to_toml(), config.train.grad_accumulation)?;
+    let data = reduce.from_first(|| {
         let mut outputs = Outputs::default();
         let file = std::slice::from_ref(&arguments.config);
         protect_inputs(&mut outputs, file, &config)?;
@@ -108,7 +105,7 @@ pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<u8> {
     let progress = StepProgress::new(0, steps as u64, per_step, data.train.len());
     let mut done = 0;
     let range = RateRange { from, to, steps };
-    let found = sweep(&config, &data, range, &place.device, ranks, |point| {
+    let found = sweep(&config, &data, range, &place, |point| {
         done += 1;
         progress.step(done, point.loss);
     })?;
@@ -127,7 +124,7 @@ pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<u8> {
         )),
         None => say("no suggestion: the loss never fell below that of the untrained network"),
     }
-    if !ranks.is_first() {
+    if !reduce.is_first() {
         return Ok(0);
     }
     for path in found.write(&stem)? {

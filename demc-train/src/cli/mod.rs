@@ -7,15 +7,14 @@ mod plot;
 mod train;
 
 use std::ffi::OsString;
-use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 
-use crate::ranks::{self, Launch, Ranks, SharedError};
 use clap::{CommandFactory, Parser, Subcommand};
-use demc_infer::compute::on_threads;
-use demc_program::{message, parallel};
+use demc_infer::compute::IsaError;
+use demc_infer::device::DeviceError;
+use demc_program::exit::USAGE;
 
-/// The exit code of a program that panicked.
-const PANICKED: u8 = 101;
+use crate::config::ConfigError;
+use crate::ranks::{Reduce, SharedError, launch};
 
 /// Train a DEMC Monte Carlo denoiser on rendered images.
 ///
@@ -62,52 +61,28 @@ pub fn command() -> clap::Command {
 
 /// Runs the program with its name and arguments. Returns the exit code.
 pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
-    let arguments = match demc_program::cli::parse::<Arguments>(arguments) {
-        Ok(arguments) => arguments,
-        Err(code) => return code,
-    };
-    let launch = match Launch::start() {
-        Ok(launch) => launch,
-        Err(error) => {
-            message::say(format_args!("error: {error}"));
-            return 1;
-        }
-    };
-    message::silence(!launch.is_first());
-    parallel::share_processors(launch.on_node().count);
-    if let Some(note) = &parallel::threads().note {
-        message::say(format_args!("note: {note}"));
-    }
-    let work = AssertUnwindSafe(|| on_threads(|| run(arguments)));
-    let done = catch_unwind(work).unwrap_or_else(|panic| {
-        // The other ranks would wait for this one.
-        ranks::abort(PANICKED);
-        resume_unwind(panic)
-    });
-    match done.map_err(anyhow::Error::from).flatten() {
-        Ok(code) => code,
-        Err(error) => {
-            let code = ranks::exit_code(&error);
-            match launch.name().filter(|_| !error.is::<SharedError>()) {
-                None => message::say(format_args!("error: {error:#}")),
-                // The other ranks know nothing of it and would wait for this one.
-                Some(name) => {
-                    message::silence(false);
-                    message::say(format_args!("error: {name}: {error:#}"));
-                    ranks::abort(code);
-                }
-            }
-            code
-        }
+    match demc_program::cli::parse(arguments) {
+        Ok(arguments) => launch::run(exit_code, |reduce| run(arguments, reduce)),
+        Err(code) => code,
     }
 }
 
-fn run(arguments: Arguments) -> anyhow::Result<u8> {
-    let ranks = Ranks::world();
+fn run(arguments: Arguments, reduce: &Reduce) -> anyhow::Result<u8> {
     match arguments.subcommand {
-        Some(SubcommandArguments::FindLr(arguments)) => find_lr::run(arguments, &ranks),
-        Some(SubcommandArguments::Ablate(arguments)) => ablate::run(arguments, &ranks),
+        Some(SubcommandArguments::FindLr(arguments)) => find_lr::run(arguments, reduce),
+        Some(SubcommandArguments::Ablate(arguments)) => ablate::run(arguments, reduce),
         Some(SubcommandArguments::Plot(arguments)) => plot::run(arguments),
-        None => train::run(arguments.train, &ranks),
+        None => train::run(arguments.train, reduce),
+    }
+}
+
+/// The exit code for an error: 2 for wrong usage or configuration, otherwise 1.
+fn exit_code(error: &anyhow::Error) -> u8 {
+    if let Some(shared) = error.downcast_ref::<SharedError>() {
+        shared.code
+    } else if error.is::<ConfigError>() || error.is::<DeviceError>() || error.is::<IsaError>() {
+        USAGE
+    } else {
+        demc_program::cli::code(error)
     }
 }

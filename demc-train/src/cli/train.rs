@@ -4,14 +4,16 @@ use std::num::NonZero;
 use std::path::{Path, PathBuf};
 
 use crate::config::{Config, ConfigError, utf8};
-use crate::ranks::Ranks;
+use crate::ranks::Reduce;
 use crate::record::progress::say;
 use crate::run::run_dir::{CONFIG, copy_in_checkpoint};
-use crate::run::session::{Session, SessionOptions, SessionOutcome};
+use crate::run::session::{Session, SessionOptions};
+use crate::run::signals::Outcome;
+use crate::run::training::scores::TestScores;
 use clap::Args;
 use demc_program::message::printable;
 
-use super::compute::{ComputeArguments, stopped};
+use super::compute::{ComputeArguments, report_stop};
 
 /// Arguments of a training.
 #[derive(Debug, Args)]
@@ -77,15 +79,15 @@ fn with_copy(error: ConfigError, config: &Path) -> ConfigError {
 }
 
 /// Trains a run, new or resumed.
-pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<u8> {
+pub fn run(arguments: Arguments, reduce: &Reduce) -> anyhow::Result<u8> {
     let mut sets = arguments.set;
     if let Some(dir) = &arguments.run_dir {
-        sets.push(ranks.agree(run_dir_set(dir).map_err(Into::into))?);
+        sets.push(reduce.agree(run_dir_set(dir).map_err(Into::into))?);
     }
     let file = arguments.config.expect("clap requires it");
     let config = Config::load(&file, &sets).map_err(|error| with_copy(error, &file));
-    let config = ranks.agree(config.map_err(Into::into))?;
-    let place = arguments.compute.place(ranks)?;
+    let config = reduce.agree(config.map_err(Into::into))?;
+    let place = arguments.compute.place(reduce)?;
     let options = SessionOptions {
         resume: arguments.resume,
         check: arguments.check,
@@ -128,19 +130,16 @@ pub fn run(arguments: Arguments, ranks: &Ranks) -> anyhow::Result<u8> {
         return Ok(0);
     }
     say(format!("run: {}\n", shown(&dir)));
-    match session.finish()? {
-        SessionOutcome::Stopped { signal, step } => {
-            return Ok(stopped(signal, step, "--resume resumes the run"));
+    let finished = match session.finish()? {
+        Outcome::Complete(finished) => finished,
+        Outcome::Stopped(stopped) => return Ok(report_stop(stopped, "--resume resumes the run")),
+    };
+    say(format!("\n{}", finished.kept));
+    match finished.scores {
+        Some(TestScores { step, report }) => {
+            say(format!("\nTest split, weights of step {step}:\n\n{report}"));
         }
-        SessionOutcome::Complete { kept, scores } => {
-            say(format!("\n{kept}"));
-            match scores {
-                Some((step, report)) => {
-                    say(format!("\nTest split, weights of step {step}:\n\n{report}"));
-                }
-                None => say("\nNo scores: the data set has no test split."),
-            }
-        }
+        None => say("\nNo scores: the data set has no test split."),
     }
     say(format!("\nweights, pictures and scores: {}", shown(&dir)));
     Ok(0)

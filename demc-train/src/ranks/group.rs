@@ -6,20 +6,20 @@ use mpi::environment::{Universe, processor_name};
 use mpi::topology::{Color, SimpleCommunicator};
 use mpi::traits::{Communicator, CommunicatorCollectives};
 
-use super::OnNode;
+use super::NodeShare;
 
 /// A group of ranks.
 pub(super) struct Group {
     communicator: SimpleCommunicator,
     /// The node of each rank.
     nodes: Vec<String>,
-    on_node: OnNode,
+    on_node: NodeShare,
 }
 
 /// The start of MPI. Dropping it ends MPI.
 pub struct Launch {
     _universe: Universe,
-    on_node: OnNode,
+    on_node: NodeShare,
 }
 
 impl Launch {
@@ -49,15 +49,15 @@ impl Launch {
     }
 
     /// This rank among those of its node.
-    pub fn on_node(&self) -> OnNode {
+    pub fn on_node(&self) -> NodeShare {
         self.on_node
     }
 }
 
-fn on_node(communicator: &SimpleCommunicator) -> OnNode {
+fn on_node(communicator: &SimpleCommunicator) -> NodeShare {
     let local = communicator.split_shared(communicator.rank());
-    OnNode {
-        rank: as_usize(local.rank()),
+    NodeShare {
+        index: as_usize(local.rank()),
         count: as_usize(local.size()),
     }
 }
@@ -132,7 +132,7 @@ impl Group {
         as_usize(self.communicator.size())
     }
 
-    pub(super) fn on_node(&self) -> OnNode {
+    pub(super) fn on_node(&self) -> NodeShare {
         self.on_node
     }
 

@@ -1,4 +1,5 @@
-//! Ranks: the processes that train one run together.
+//! Ranks: the processes that train one run together. [`Reduce`] is all that the rest of the crate knows
+//! of them.
 //!
 //! A build without the feature `mpi` has one rank and contains nothing of MPI. With it, `mpirun` and
 //! `srun` start the ranks. Each rank computes a contiguous share of a step's micro-batches. Then all
@@ -6,11 +7,15 @@
 //! depends on an order is done in the order of the micro-batches, so the number of ranks changes no
 //! bit.
 
+pub mod cluster;
+pub mod gradients;
 #[cfg(feature = "mpi")]
 mod group;
 #[cfg(not(feature = "mpi"))]
 #[path = "no_group.rs"]
 mod group;
+pub mod groups;
+pub mod launch;
 mod placement;
 pub mod tree;
 
@@ -20,39 +25,41 @@ use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use demc_infer::compute::IsaError;
-use demc_infer::device::DeviceError;
-use demc_program::exit::UsageError;
-use demc_program::output::OutputError;
+use demc_program::checksum::sha256_of;
+use demc_program::exit::{FAILURE, UsageError};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::config::ConfigError;
 use group::Group;
-pub use group::{Launch, abort};
 use placement::{Place, Placement};
 use tree::{Block, PairwiseSum};
 
-/// The ranks of one run. Clones share them.
-#[derive(Clone, Default)]
-pub struct Ranks {
+/// The exchange between the ranks of one run; by default a single rank. Clones share it.
+///
+/// Every rank must call its methods in the same order, unless a method says otherwise.
+#[derive(Clone)]
+pub struct Reduce {
     /// `None` for a single rank.
     group: Option<Rc<Group>>,
     /// Time spent in exchanges, the wait for slower ranks included.
     spent: Rc<Cell<Duration>>,
+    exit_code: ExitCode,
 }
 
-/// A rank among those of its node.
+/// The exit code that a program has for an error.
+pub type ExitCode = fn(&anyhow::Error) -> u8;
+
+/// A process among those of its node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct OnNode {
+pub struct NodeShare {
     /// From 0.
-    pub rank: usize,
+    pub index: usize,
     /// At least 1.
     pub count: usize,
 }
 
-/// A rank without others on its node.
-const ALONE: OnNode = OnNode { rank: 0, count: 1 };
+/// A process without others on its node.
+const ALONE: NodeShare = NodeShare { index: 0, count: 1 };
 
 /// An error that all ranks know of. Rank 0 prints it.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -61,33 +68,30 @@ pub struct SharedError {
     /// The message, with the rank and the node if not all ranks failed alike.
     text: String,
     /// The exit code of the first rank that failed.
-    code: u8,
+    pub code: u8,
 }
 
 /// What a rank sends: its value or its error.
 type Sent<T> = Result<T, (String, u8)>;
 
-/// The exit code for an error: 2 for wrong usage or configuration, otherwise 1.
-pub fn exit_code(error: &anyhow::Error) -> u8 {
-    if let Some(shared) = error.downcast_ref::<SharedError>() {
-        return shared.code;
+impl Default for Reduce {
+    fn default() -> Self {
+        Reduce::of(None, |_| FAILURE)
     }
-    let refused = error.downcast_ref().is_some_and(OutputError::is_usage);
-    let usage = error.is::<ConfigError>()
-        || error.is::<DeviceError>()
-        || error.is::<IsaError>()
-        || error.is::<UsageError>()
-        || refused;
-    if usage { 2 } else { 1 }
 }
 
-impl Ranks {
-    /// All ranks that were started together. Call it on the thread that trains.
-    pub fn world() -> Self {
-        Ranks {
-            group: Group::world().map(Rc::new),
-            ..Self::default()
+impl Reduce {
+    fn of(group: Option<Group>, exit_code: ExitCode) -> Self {
+        Reduce {
+            group: group.map(Rc::new),
+            spent: Rc::default(),
+            exit_code,
         }
+    }
+
+    /// All ranks that were started together. Call it on the thread that trains.
+    pub fn world(exit_code: ExitCode) -> Self {
+        Reduce::of(Group::world(), exit_code)
     }
 
     /// Splits the ranks into groups of `size` and returns this rank's group and its number. The last
@@ -95,11 +99,7 @@ impl Ranks {
     pub fn split(&self, size: usize) -> (Self, usize) {
         let number = self.rank() / size;
         let group = self.group.as_ref().and_then(|group| group.split(number));
-        let part = Ranks {
-            group: group.map(Rc::new),
-            ..Self::default()
-        };
-        (part, number)
+        (Reduce::of(group, self.exit_code), number)
     }
 
     /// This rank, from 0.
@@ -112,8 +112,8 @@ impl Ranks {
         self.group.as_ref().map_or(1, |group| group.count())
     }
 
-    /// This rank among those of its node.
-    pub fn on_node(&self) -> OnNode {
+    /// This process among those of its node.
+    pub fn on_node(&self) -> NodeShare {
         self.group.as_ref().map_or(ALONE, |group| group.on_node())
     }
 
@@ -138,7 +138,7 @@ impl Ranks {
         self.spent.take()
     }
 
-    /// The values of all ranks, in order. Every rank must call it.
+    /// The values of all ranks, in order.
     ///
     /// # Errors
     /// On every rank, if one rank has an error.
@@ -149,14 +149,16 @@ impl Ranks {
         let Some(group) = &self.group else {
             return Ok(vec![own?]);
         };
-        let own: Sent<T> = own.map_err(|error| (format!("{error:#}"), exit_code(&error)));
-        let sent = serde_json::to_vec(&own).context("a message between ranks")?;
+        let own: Sent<T> = own.map_err(|error| (format!("{error:#}"), (self.exit_code)(&error)));
+        // CBOR keeps all bits of a number, infinite and NaN included.
+        let mut sent = Vec::new();
+        ciborium::into_writer(&own, &mut sent).context("a message between ranks")?;
         let received = self.timed(|| group.gather_bytes(&sent));
         let mut values = Vec::with_capacity(received.len());
         let mut errors = Vec::new();
         for (rank, message) in received.iter().enumerate() {
             let value: Sent<T> =
-                serde_json::from_slice(message).context("a message between ranks")?;
+                ciborium::from_reader(&message[..]).context("a message between ranks")?;
             match value {
                 Ok(value) => values.push(value),
                 Err((text, code)) => errors.push((rank, text, code)),
@@ -174,7 +176,40 @@ impl Ranks {
         Err(SharedError { text, code }.into())
     }
 
-    /// This rank's value, if no rank has an error. Every rank must call it.
+    /// The items of all ranks, in order.
+    ///
+    /// # Errors
+    /// On every rank, if one rank has an error.
+    pub fn concat<T: Serialize + DeserializeOwned>(
+        &self,
+        own: anyhow::Result<Vec<T>>,
+    ) -> anyhow::Result<Vec<T>> {
+        Ok(self.gather(own)?.into_iter().flatten().collect())
+    }
+
+    /// The results of `work` on all items, in order. The ranks deal out the items among themselves.
+    ///
+    /// # Errors
+    /// On every rank, the first error of a rank.
+    pub fn deal<I, T: Serialize + DeserializeOwned>(
+        &self,
+        items: &[I],
+        mut work: impl FnMut(usize, &I) -> anyhow::Result<T>,
+    ) -> anyhow::Result<Vec<T>> {
+        let own: anyhow::Result<Vec<T>> = items
+            .iter()
+            .enumerate()
+            .skip(self.rank())
+            .step_by(self.count())
+            .map(|(index, item)| work(index, item))
+            .collect();
+        let mut dealt: Vec<_> = self.gather(own)?.into_iter().map(Vec::into_iter).collect();
+        Ok((0..items.len())
+            .filter_map(|index| dealt[index % self.count()].next())
+            .collect())
+    }
+
+    /// This rank's value, if no rank has an error.
     ///
     /// # Errors
     /// On every rank, if one rank has an error.
@@ -190,6 +225,30 @@ impl Ranks {
         value.context("a rank without an error has a value")
     }
 
+    /// Rank 0 makes a value with `first` and sends `tell` of it. The others make theirs from what was
+    /// sent, with `join`.
+    ///
+    /// # Errors
+    /// On every rank, if one rank has an error.
+    pub fn broadcast<T, M: Serialize + DeserializeOwned>(
+        &self,
+        first: impl FnOnce() -> anyhow::Result<T>,
+        tell: impl FnOnce(&T) -> M,
+        join: impl FnOnce(M) -> anyhow::Result<T>,
+    ) -> anyhow::Result<T> {
+        if self.group.is_none() {
+            return first();
+        }
+        let mut own = None;
+        let message = self.from_first(|| {
+            let value = first()?;
+            let message = tell(&value);
+            own = Some(value);
+            Ok(message)
+        })?;
+        self.agree(own.map_or_else(|| join(message), Ok))
+    }
+
     /// Rank 0's value on every rank. The others do not call `make`.
     ///
     /// # Errors
@@ -202,7 +261,8 @@ impl Ranks {
             return make();
         }
         let own = self.is_first().then(make).transpose();
-        let first = self.gather(own)?.into_iter().next().flatten();
+        // A list, because `Some(())` and `None` are the same in a message.
+        let first = self.concat(own.map(Vec::from_iter))?.into_iter().next();
         first.context("rank 0 has a value")
     }
 
@@ -211,7 +271,7 @@ impl Ranks {
     ///
     /// # Errors
     /// On every rank: the first rank that differs from rank 0, and the first differing line.
-    pub fn compare(
+    fn compare(
         &self,
         what: &str,
         make: impl FnOnce() -> anyhow::Result<String>,
@@ -240,12 +300,23 @@ impl Ranks {
         Err(SharedError { text, code: 1 }.into())
     }
 
+    /// Refuses ranks that differ in program or in `config`, the text of the configuration, and a number
+    /// of ranks that does not divide the micro-batches of a step.
+    ///
+    /// # Errors
+    /// What differs, or the numbers of ranks that would do.
+    pub fn check(&self, config: &str, grad_accumulation: usize) -> anyhow::Result<()> {
+        self.compare("the program", program)?;
+        self.compare("the configuration", || Ok(config.to_owned()))?;
+        self.agree(check_divides(self.count(), grad_accumulation))
+    }
+
     /// Sums vectors over all `terms` terms of all ranks in the order of [`PairwiseSum`]. `blocks` are
     /// the sums of this rank's share of the terms.
     ///
     /// # Shapes
     /// All sums have the same length, which is that of the result.
-    pub fn sum(&self, blocks: Vec<Block<Vec<f32>>>, terms: usize) -> Option<Vec<f32>> {
+    fn sum_blocks(&self, blocks: Vec<Block<Vec<f32>>>, terms: usize) -> Option<Vec<f32>> {
         match &self.group {
             None => {
                 let mut sum = PairwiseSum::default();
@@ -301,6 +372,13 @@ pub fn check_divides(count: usize, grad_accumulation: usize) -> anyhow::Result<(
     .into())
 }
 
+/// The version and checksum of this program, which must be the same on all ranks.
+fn program() -> anyhow::Result<String> {
+    let version = env!("CARGO_PKG_VERSION");
+    let file = std::env::current_exe().context("the program's own file")?;
+    Ok(format!("{version}, SHA-256 {}", sha256_of(&file)?))
+}
+
 fn add(mut left: Vec<f32>, right: Vec<f32>) -> Vec<f32> {
     for (left, right) in left.iter_mut().zip(right) {
         *left += right;
@@ -310,24 +388,24 @@ fn add(mut left: Vec<f32>, right: Vec<f32>) -> Vec<f32> {
 
 /// Every rank gets a slice of all blocks of all ranks, sums it, and sends its sum to all.
 fn exchanged(
-    ranks: &Ranks,
+    reduce: &Reduce,
     group: &Group,
     blocks: Vec<Block<Vec<f32>>>,
     terms: usize,
 ) -> Option<Vec<f32>> {
     let length = blocks.first()?.sum.len();
-    let slices: Vec<Range<usize>> = (0..ranks.count())
-        .map(|rank| ranks.share_of(rank, length))
+    let slices: Vec<Range<usize>> = (0..reduce.count())
+        .map(|rank| reduce.share_of(rank, length))
         .collect();
-    let own = ranks.share(length);
+    let own = reduce.share(length);
     let mut sent = Vec::with_capacity(length * blocks.len());
     for slice in &slices {
         for block in &blocks {
             sent.extend_from_slice(&block.sum[slice.clone()]);
         }
     }
-    let shapes: Vec<Vec<Block<()>>> = (0..ranks.count())
-        .map(|rank| tree::blocks_of(ranks.share_of(rank, terms)))
+    let shapes: Vec<Vec<Block<()>>> = (0..reduce.count())
+        .map(|rank| tree::blocks_of(reduce.share_of(rank, terms)))
         .collect();
     let to: Vec<usize> = slices.iter().map(|s| s.len() * blocks.len()).collect();
     let from: Vec<usize> = shapes.iter().map(|s| s.len() * own.len()).collect();
@@ -356,17 +434,24 @@ mod tests {
 
     #[test]
     fn one_rank_has_everything() {
-        let ranks = Ranks::default();
-        assert_eq!((ranks.rank(), ranks.count(), ranks.share(7)), (0, 1, 0..7));
-        assert_eq!(ranks.gather(Ok(3)).expect("its own"), [3]);
+        let reduce = Reduce::default();
+        assert_eq!(
+            (reduce.rank(), reduce.count(), reduce.share(7)),
+            (0, 1, 0..7)
+        );
+        assert_eq!(reduce.gather(Ok(3)).expect("its own"), [3]);
         let block = |first: usize, value: f32| Block {
             first,
             terms: 1,
             sum: vec![value],
         };
         let blocks = vec![block(0, 1.0), block(1, 2.0), block(2, 4.0)];
-        assert_eq!(ranks.sum(blocks, 3), Some(vec![7.0]));
-        let error = ranks.agree::<()>(Err(UsageError("no".into()).into()));
-        assert_eq!(exit_code(&error.expect_err("its own")), 2);
+        assert_eq!(reduce.sum_blocks(blocks, 3), Some(vec![7.0]));
+        let error = reduce.agree::<()>(Err(UsageError("no".into()).into()));
+        assert!(error.expect_err("its own").is::<UsageError>());
+        let doubled = reduce.deal(&[1, 2, 3], |index, item| Ok(index + 2 * item));
+        assert_eq!(doubled.expect("its own"), [2, 5, 8]);
+        let told = reduce.broadcast(|| Ok(4), |value| *value, |_: i32| unreachable!("no other"));
+        assert_eq!(told.expect("its own"), 4);
     }
 }

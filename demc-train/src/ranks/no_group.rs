@@ -1,6 +1,6 @@
 //! A build without MPI: there is no group of ranks.
 
-use super::OnNode;
+use super::NodeShare;
 
 /// A group of ranks. None exists in this build.
 pub(super) enum Group {}
@@ -28,7 +28,7 @@ impl Launch {
     }
 
     /// This rank among those of its node.
-    pub fn on_node(&self) -> OnNode {
+    pub fn on_node(&self) -> NodeShare {
         super::ALONE
     }
 }
@@ -53,7 +53,7 @@ impl Group {
         match *self {}
     }
 
-    pub(super) fn on_node(&self) -> OnNode {
+    pub(super) fn on_node(&self) -> NodeShare {
         match *self {}
     }
 

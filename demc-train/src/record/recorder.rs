@@ -16,12 +16,12 @@ use crate::run::validation::write_strip;
 /// Directory of the TensorBoard events in a run directory.
 const TENSORBOARD: &str = "tensorboard";
 
-/// TensorBoard's name for the share of a step that ranks spend on exchanges.
+/// TensorBoard's name for the share of a step that processes spend on exchanges.
 const EXCHANGE: &str = "train/exchange_share";
 
 /// The records of one session.
 pub struct Recorder(
-    /// `None` on ranks that record nothing.
+    /// `None` if nothing is recorded.
     Option<Records>,
 );
 
@@ -70,12 +70,12 @@ impl Recorder {
         })))
     }
 
-    /// Records nothing, on ranks other than the first.
+    /// Records nothing: another process does.
     pub fn silent() -> Self {
         Recorder(None)
     }
 
-    /// Records a step, its duration, and the part of it that went into exchanges between ranks.
+    /// Records a step, its duration, and the part of it that went into exchanges with other processes.
     pub fn step(&mut self, step: u64, loss: f64, time: Duration, exchange: Duration) {
         if let Recorder(Some(records)) = self {
             records.pace.step(time, exchange);
@@ -159,7 +159,7 @@ impl Pace {
         self.exchange += exchange;
     }
 
-    /// Share of the time since the last `take` that went into exchanges; `None` with one rank.
+    /// Share of the time since the last `take` that went into exchanges; `None` without any.
     fn exchange_share(&self) -> Option<f64> {
         let share = self.exchange.as_secs_f64() / self.time.as_secs_f64();
         (!self.exchange.is_zero()).then_some(share)

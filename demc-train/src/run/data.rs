@@ -1,6 +1,7 @@
 //! The data of a run: the scenes of each split, and the statistics of the training scenes.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -21,10 +22,10 @@ use demc_program::output::Outputs;
 use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
-use crate::ranks::{OnNode, Ranks};
+use crate::ranks::NodeShare;
 
 /// The scenes and statistics of a run.
-#[derive(Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct RunData {
     /// Channels of the files.
     pub layout: ChannelLayout,
@@ -94,14 +95,13 @@ pub fn protect_inputs(
     Ok(())
 }
 
-/// The batches of this rank's share of the steps from `step` on, in steps of `per_step` batches.
-pub fn rank_loader(
+/// The batches of a `share` of each step from `step` on, in steps of `per_step` batches.
+pub fn share_loader(
     source: Arc<PatchSource>,
-    ranks: &Ranks,
+    share: Range<usize>,
     per_step: usize,
     step: u64,
 ) -> BatchLoader {
-    let share = ranks.share(per_step);
     let (first, own) = (share.start as u64, share.len() as u64);
     let number = move |n: u64| n / own * per_step as u64 + first + n % own;
     BatchLoader::of_numbers(source, step * own, number)
@@ -175,13 +175,13 @@ impl RunData {
         })
     }
 
-    /// Compares the files on this node with the checksums. The ranks of the node share the work.
+    /// Compares the files on this node with the checksums. The processes of the node share the work.
     ///
     /// # Errors
     /// The first scene that is missing or differs.
-    pub fn check_files(&self, on_node: OnNode) -> anyhow::Result<()> {
+    pub fn check_files(&self, node: NodeShare) -> anyhow::Result<()> {
         let scenes = self.train.iter().chain(&self.validation).chain(&self.test);
-        for scene in scenes.skip(on_node.rank).step_by(on_node.count) {
+        for scene in scenes.skip(node.index).step_by(node.count) {
             let found = sha256_of(&scene.path).with_context(|| format!("scene {}", scene.name))?;
             ensure!(
                 self.checksums.get(&scene.name) == Some(&found),
@@ -194,18 +194,18 @@ impl RunData {
     }
 
     /// The source of the training patches, whose albedo is filtered as validation and denoising
-    /// filter it. The ranks of a node share `data.cache_mib`.
+    /// filter it. The processes of a node share `data.cache_mib`.
     ///
     /// # Errors
     /// Scenes smaller than a patch.
     pub fn patch_source(
         &self,
         config: &Config,
-        on_node: OnNode,
+        node: NodeShare,
         albedo_filter: Option<&Bundle>,
     ) -> Result<PatchSource, demc_data::Error> {
         let mut data = config.data.clone();
-        data.cache_mib /= on_node.count;
+        data.cache_mib /= node.count;
         let source = PatchSource::new(
             &data,
             self.train.clone(),

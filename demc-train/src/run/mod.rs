@@ -2,8 +2,10 @@
 
 pub mod checkpoint;
 pub mod data;
+pub mod estimate;
 pub mod initial;
 pub mod observer;
+pub mod place;
 pub mod run_dir;
 pub mod run_record;
 pub mod session;

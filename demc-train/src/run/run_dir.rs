@@ -97,7 +97,7 @@ impl RunDir {
         Ok(dir)
     }
 
-    /// The directory on ranks that write nothing into it.
+    /// The directory for a process that writes nothing into it.
     pub fn unclaimed(config: &Config) -> Self {
         RunDir {
             path: config.run_dir().to_path_buf(),

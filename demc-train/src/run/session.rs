@@ -2,26 +2,26 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, ensure};
+use anyhow::ensure;
 use burn::tensor::Device;
 use demc_infer::compute;
-use demc_infer::evaluate::Report;
-use demc_program::checksum::sha256_of;
 use demc_program::exit::UsageError;
 use demc_program::output::Outputs;
-
 use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
-use crate::ranks::{self, Ranks};
+use crate::ranks::cluster::ClusterEstimate;
+use crate::ranks::{NodeShare, check_divides};
 use crate::run::checkpoint::store::{CheckpointSearch, CheckpointStore};
 use crate::run::checkpoint::{self, Checkpoint};
 use crate::run::data::{RunData, protect_inputs};
+use crate::run::estimate::{DurationEstimate, check_memory};
 use crate::run::observer::TakenStep;
+use crate::run::place::SessionPlace;
 use crate::run::run_dir::{self, RunDir};
-use crate::run::signals::Signals;
-use crate::run::training::{LoopEnd, TrainingRun};
-use crate::tools::estimate::{ClusterEstimate, DurationEstimate, check_memory};
+use crate::run::signals::{Outcome, Signals};
+use crate::run::training::TrainingRun;
+use crate::run::training::scores::TestScores;
 
 /// A run that can start, and what the user should know about it.
 pub struct Session {
@@ -33,40 +33,19 @@ pub struct Session {
     pub warnings: Vec<String>,
     /// Notes for the user.
     pub notes: Vec<String>,
-    /// Ranks, nodes, threads, and devices; `None` for a single rank.
+    /// The processes of the run, their nodes, threads, and devices; `None` for a single process.
     pub placement: Option<String>,
     first_step: u64,
     place: SessionPlace,
 }
 
-/// How a session ended.
-#[derive(Debug)]
-pub enum SessionOutcome {
-    /// The run is complete.
-    Complete {
-        /// One sentence on which weights the run keeps, and why.
-        kept: String,
-        /// The step of the kept weights and their scores, if there is a test split.
-        scores: Option<(u64, Box<Report>)>,
-    },
-    /// A signal stopped the run; everything is saved.
-    Stopped {
-        /// The signal.
-        signal: i32,
-        /// The last step.
-        step: u64,
-    },
-}
-
-/// Where a session computes.
-#[derive(Clone)]
-pub struct SessionPlace {
-    /// Device without autodiff.
-    pub device: Device,
-    /// Its name, for the record.
-    pub device_name: String,
-    /// The ranks of the run.
-    pub ranks: Ranks,
+/// A finished run.
+#[derive(Clone, Debug)]
+pub struct FinishedRun {
+    /// One sentence on which weights the run keeps, and why.
+    pub kept: String,
+    /// The scores of the kept weights, if there is a test split.
+    pub scores: Option<TestScores>,
 }
 
 /// Options of a session.
@@ -79,62 +58,36 @@ pub struct SessionOptions {
 }
 
 impl Session {
-    /// Reads the data and, to resume, the checkpoint.
-    ///
-    /// Rank 0 reads the scenes and brings the run directory into order. Then every rank checks its
-    /// node's files, and reads the checkpoint.
+    /// Reads the data and, to resume, the checkpoint. The first process brings the run directory into
+    /// order; the others follow it.
     ///
     /// # Errors
     /// A run directory with another run, or in use by another process; invalid data or checkpoint;
-    /// ranks that differ in program, configuration, or data.
+    /// processes that differ in program, configuration, or data.
     pub fn open(
         config: Config,
         options: SessionOptions,
         place: &SessionPlace,
     ) -> anyhow::Result<Self> {
-        let SessionPlace {
-            device,
-            device_name,
-            ranks,
-        } = place;
-        ranks.compare("the program", program)?;
-        ranks.compare("the configuration", || Ok(config.to_toml()))?;
-        ranks.agree(ranks::check_divides(
-            ranks.count(),
-            config.train.grad_accumulation,
-        ))?;
-        let first = ranks
-            .is_first()
-            .then(|| Prepared::new(&config, options, device));
-        let (first, told) = match first.transpose() {
-            Ok(Some(Prepared {
-                dir,
-                checkpoint,
-                told,
-            })) => (Some((dir, checkpoint)), Ok(Some(told))),
-            Ok(None) => (None, Ok(None)),
-            Err(error) => (None, Err(error)),
-        };
-        let told = ranks.gather(told)?.into_iter().next().flatten();
-        let Told {
+        let SessionPlace { device, reduce, .. } = place;
+        reduce.check(&config.to_toml(), config.train.grad_accumulation)?;
+        let Opened {
+            dir,
             data,
             checkpoint,
             mut notes,
-        } = told.context("rank 0 prepares the run")?;
-        let own = || -> anyhow::Result<(RunDir, Option<Checkpoint>)> {
-            check_memory(&config, device, ranks.on_node().count)?;
-            if let Some(first) = first {
-                return Ok(first);
-            }
-            data.check_files(ranks.on_node())?;
-            let checkpoint = checkpoint.map(|dir| load_checkpoint(&dir, &config, device));
-            Ok((RunDir::unclaimed(&config), checkpoint.transpose()?))
-        };
-        let (dir, checkpoint) = ranks.agree(own())?;
-        let first_step = checkpoint.as_ref().map_or(0, |found| found.state.step);
+        } = reduce.broadcast(
+            || Opened::new(&config, options, device),
+            Opened::message,
+            |message| message.open(&config, device, reduce.on_node()),
+        )?;
+        reduce.agree(check_memory(&config, device, reduce.on_node().count))?;
+        let first_step = checkpoint
+            .as_ref()
+            .map_or(0, |found| found.loaded.state.step);
         let autodiff = device.clone().autodiff();
         let estimate =
-            DurationEstimate::measure(&config, &data, first_step, &autodiff, ranks.count());
+            DurationEstimate::measure(&config, &data, first_step, &autodiff, reduce.count());
         if data.clamped > 0 {
             let clamped = data.clamped;
             notes.push(format!(
@@ -142,10 +95,10 @@ impl Session {
             ));
         }
         let (summary, warnings) = (data.summary(), data.warnings.clone());
-        let run = TrainingRun::new(config, data, dir, checkpoint, device, ranks.clone());
-        let run = ranks.agree(run)?;
+        let checkpoint = checkpoint.map(|found| found.loaded);
+        let run = reduce.agree(TrainingRun::new(config, data, dir, checkpoint, place))?;
         notes.extend(run.initial().map(|initial| initial.note(run.config())));
-        let placement = ranks.describe(device_name, run.parameters())?;
+        let placement = reduce.describe(&place.device_name, run.parameters())?;
         Ok(Session {
             run,
             estimate,
@@ -168,13 +121,12 @@ impl Session {
     /// # Errors
     /// A file of the run that is an input or cannot be replaced.
     pub fn check_outputs(&self, files: &[PathBuf]) -> anyhow::Result<()> {
-        self.place.ranks.agree(self.check_own_outputs(files))
+        self.place
+            .reduce
+            .from_first(|| self.check_own_outputs(files))
     }
 
     fn check_own_outputs(&self, files: &[PathBuf]) -> anyhow::Result<()> {
-        if !self.place.ranks.is_first() {
-            return Ok(());
-        }
         let mut config = self.run.config().clone();
         // Only a new run reads its initial weights.
         config.train.init.take_if(|_| self.run.initial().is_none());
@@ -210,11 +162,12 @@ impl Session {
             return Err(UsageError(problem).into());
         }
         let config = self.run.config();
-        ranks::check_divides(count, config.train.grad_accumulation)?;
+        check_divides(count, config.train.grad_accumulation)?;
         let share = self
             .run
             .estimate(self.first_step, &self.place.device, count);
-        let cluster = ClusterEstimate::new(&share, self.run.parameters(), count, bandwidth * 1e9);
+        let floats = self.run.parameters();
+        let cluster = ClusterEstimate::new(share.step, floats, count, bandwidth * 1e9);
         let steps = config.train.steps.saturating_sub(self.first_step);
         let hours = cluster.step() * steps as f64 / 3600.0;
         Ok(format!("{cluster}; {hours:.1} hours for {steps} steps"))
@@ -224,7 +177,7 @@ impl Session {
     ///
     /// # Errors
     /// Those of [`TrainingRun::train`] and [`TrainingRun::test`].
-    pub fn finish(self) -> anyhow::Result<SessionOutcome> {
+    pub fn finish(self) -> anyhow::Result<Outcome<FinishedRun>> {
         let signals = Signals::listen()?;
         self.finish_observed(move |_| signals.received())
     }
@@ -237,37 +190,41 @@ impl Session {
     pub fn finish_observed(
         mut self,
         observer: impl FnMut(&TakenStep) -> Option<i32>,
-    ) -> anyhow::Result<SessionOutcome> {
-        match self.run.train(&self.place.device_name, observer)? {
-            LoopEnd::Stopped { signal, step } => Ok(SessionOutcome::Stopped { signal, step }),
-            LoopEnd::Done => {
-                let scores = self.run.test(&self.place.device)?;
-                Ok(SessionOutcome::Complete {
-                    kept: self.run.kept_weights(),
-                    scores: scores.map(|(step, report)| (step, Box::new(report))),
-                })
-            }
+    ) -> anyhow::Result<Outcome<FinishedRun>> {
+        if let Some(stopped) = self.run.train(&self.place.device_name, observer)? {
+            return Ok(Outcome::Stopped(stopped));
         }
+        Ok(Outcome::Complete(FinishedRun {
+            scores: self.run.test(&self.place.device)?,
+            kept: self.run.kept_weights(),
+        }))
     }
 }
 
-/// What rank 0 does before the others start.
-struct Prepared {
+/// What a session works on.
+struct Opened {
     dir: RunDir,
-    checkpoint: Option<Checkpoint>,
-    told: Told,
+    data: RunData,
+    checkpoint: Option<OpenedCheckpoint>,
+    notes: Vec<String>,
 }
 
-/// What rank 0 tells the others.
+struct OpenedCheckpoint {
+    dir: PathBuf,
+    loaded: Checkpoint,
+}
+
+/// What the first process tells the others.
 #[derive(Serialize, Deserialize)]
-struct Told {
+struct OpenedMessage {
     data: RunData,
     /// The directory of the checkpoint to resume from.
     checkpoint: Option<PathBuf>,
     notes: Vec<String>,
 }
 
-impl Prepared {
+impl Opened {
+    /// Claims the run directory, restores it to resume, and reads the data.
     fn new(config: &Config, options: SessionOptions, device: &Device) -> anyhow::Result<Self> {
         let SessionOptions { resume, check } = options;
         let mut dir = RunDir::claim(config, resume)?;
@@ -281,28 +238,42 @@ impl Prepared {
         } else {
             None
         };
-        let (path, checkpoint) = checkpoint.unzip();
         let data = RunData::open(config)?;
         if resume {
             dir.check_scenes(&data)?;
         }
-        Ok(Prepared {
+        Ok(Opened {
             dir,
+            data,
             checkpoint,
-            told: Told {
-                data,
-                checkpoint: path,
-                notes,
-            },
+            notes,
         })
+    }
+
+    fn message(&self) -> OpenedMessage {
+        OpenedMessage {
+            data: self.data.clone(),
+            checkpoint: self.checkpoint.as_ref().map(|found| found.dir.clone()),
+            notes: self.notes.clone(),
+        }
     }
 }
 
-/// The version and checksum of this program, which must be the same on all ranks.
-fn program() -> anyhow::Result<String> {
-    let version = env!("CARGO_PKG_VERSION");
-    let file = std::env::current_exe().context("the program's own file")?;
-    Ok(format!("{version}, SHA-256 {}", sha256_of(&file)?))
+impl OpenedMessage {
+    /// Reads the same checkpoint, and checks the same data on this node, without writing anything.
+    fn open(self, config: &Config, device: &Device, node: NodeShare) -> anyhow::Result<Opened> {
+        self.data.check_files(node)?;
+        let checkpoint = self.checkpoint.map(|dir| {
+            let loaded = load_checkpoint(&dir, config, device)?;
+            anyhow::Ok(OpenedCheckpoint { dir, loaded })
+        });
+        Ok(Opened {
+            dir: RunDir::unclaimed(config),
+            data: self.data,
+            checkpoint: checkpoint.transpose()?,
+            notes: self.notes,
+        })
+    }
 }
 
 /// The checkpoint to resume from. With `restore`, the run directory is brought to its state.
@@ -312,7 +283,7 @@ fn latest_checkpoint(
     restore: bool,
     device: &Device,
     notes: &mut Vec<String>,
-) -> anyhow::Result<Option<(PathBuf, Checkpoint)>> {
+) -> anyhow::Result<Option<OpenedCheckpoint>> {
     let CheckpointSearch { intact, damaged } = CheckpointStore::new(run).newest_intact()?;
     let Some(intact) = intact else {
         ensure!(
@@ -328,13 +299,16 @@ fn latest_checkpoint(
         return Ok(None);
     };
     notes.extend(damaged);
-    let checkpoint = load_checkpoint(&intact, config, device)?;
+    let loaded = load_checkpoint(&intact, config, device)?;
     notes.push(format!("resuming from {}", intact.display()));
     if restore {
         notes.extend(checkpoint::restore_run(run, &intact)?);
         CheckpointStore::new(run).remove_old(&intact, config.run.keep)?;
     }
-    Ok(Some((intact, checkpoint)))
+    Ok(Some(OpenedCheckpoint {
+        dir: intact,
+        loaded,
+    }))
 }
 
 fn load_checkpoint(dir: &Path, config: &Config, device: &Device) -> anyhow::Result<Checkpoint> {

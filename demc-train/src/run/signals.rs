@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use anyhow::Context;
+use serde::{Deserialize, Serialize};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
 
@@ -12,6 +13,24 @@ use signal_hook::flag;
 const SIGNALS: [i32; 3] = [SIGINT, SIGTERM, signal_hook::consts::SIGHUP];
 #[cfg(not(unix))]
 const SIGNALS: [i32; 2] = [SIGINT, SIGTERM];
+
+/// A signal that stopped a run. Everything up to a step is saved.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Stopped {
+    /// The signal.
+    pub signal: i32,
+    /// The last step.
+    pub step: u64,
+}
+
+/// How work that a signal can stop ended.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Outcome<T> {
+    /// The work is complete.
+    Complete(T),
+    /// A signal stopped it.
+    Stopped(Stopped),
+}
 
 /// Records signals until it is dropped; after that the first signal ends the process.
 pub struct Signals {

@@ -1,7 +1,8 @@
 //! The training loop.
 
-mod scores;
+pub mod scores;
 
+use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{bail, ensure};
@@ -12,21 +13,23 @@ use demc_infer::bundle::Bundle;
 use demc_model::Denoiser;
 
 use crate::config::{Config, OnNan};
-use crate::ranks::Ranks;
+use crate::ranks::Reduce;
 use crate::record::metrics_log::MetricsLine;
 use crate::record::recorder::{Recorder, timed};
 use crate::run::checkpoint::store::CheckpointStore;
 use crate::run::checkpoint::{self, Checkpoint, LoopState, MetricSums, SessionClock};
-use crate::run::data::{RunData, rank_loader};
+use crate::run::data::{RunData, share_loader};
+use crate::run::estimate::DurationEstimate;
 use crate::run::initial::{InitialNetwork, InitialWeights, initial_network};
 use crate::run::observer::TakenStep;
+use crate::run::place::SessionPlace;
 use crate::run::run_dir::RunDir;
 use crate::run::run_record::RunFacts;
+use crate::run::signals::Stopped;
 use crate::run::validation::Validation;
 use crate::run::warnings::LoopFacts;
 use crate::step::optimizer::{DormantChannels, Optimizer};
 use crate::step::trainer::{StepReport, Trainer};
-use crate::tools::estimate::DurationEstimate;
 
 /// Consecutive skipped steps after which a run fails despite `train.on_nan = "skip"`; ours.
 const MAX_SKIPPED: u64 = 100;
@@ -45,87 +48,110 @@ pub struct TrainingRun {
     initial: Option<InitialWeights>,
     /// Steps skipped since the last one that was taken.
     skipped_in_a_row: u64,
-    ranks: Ranks,
+    reduce: Reduce,
 }
 
-/// How the training loop ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum LoopEnd {
-    /// After its last step.
-    Done,
-    /// On a signal, after a checkpoint of this step.
-    Stopped {
-        /// The signal.
-        signal: i32,
-        /// The step.
-        step: u64,
-    },
+/// What a session starts from: a new run, or a checkpoint.
+struct StartingPoint {
+    model: Denoiser,
+    albedo_filter: Option<Box<Bundle>>,
+    average: Option<Denoiser>,
+    optimizer: Optimizer,
+    state: LoopState,
+    initial: Option<InitialWeights>,
+}
+
+impl StartingPoint {
+    /// Step 0. The ranges of the initial weights' scenes are added to those of `data`.
+    fn of_new_run(config: &Config, data: &mut RunData, device: &Device) -> anyhow::Result<Self> {
+        let InitialNetwork {
+            model,
+            albedo_filter,
+            weights,
+        } = initial_network(config, data.normalizer.flat_color, device)?;
+        let before = weights.as_ref().and_then(|weights| weights.ranges.as_ref());
+        if let Some(before) = before {
+            data.ranges = data.ranges.with(before);
+        }
+        Ok(StartingPoint {
+            model,
+            albedo_filter,
+            average: None,
+            optimizer: Optimizer::new(config),
+            state: LoopState::start(),
+            initial: weights,
+        })
+    }
+
+    /// The step of `checkpoint`, which has the ranges of `data`, too. `run` names the run in errors.
+    fn of_checkpoint(
+        checkpoint: Checkpoint,
+        config: &Config,
+        data: &mut RunData,
+        run: &Path,
+    ) -> anyhow::Result<Self> {
+        let Checkpoint {
+            bundle,
+            average,
+            optimizer,
+            state,
+        } = checkpoint;
+        if let Some(ranges) = &bundle.meta.ranges {
+            data.ranges = ranges.clone();
+        }
+        ensure!(
+            bundle.meta == data.meta(config.model, state.step),
+            "{}: network, layout or statistics of the checkpoint differ from this run's",
+            run.display()
+        );
+        ensure!(
+            average.is_some() == config.train.ema_decay.is_some(),
+            "{}: either the checkpoint or train.ema_decay has no weight average",
+            run.display()
+        );
+        Ok(StartingPoint {
+            model: bundle.model,
+            albedo_filter: bundle.albedo_filter,
+            average,
+            optimizer,
+            state,
+            initial: None,
+        })
+    }
 }
 
 impl TrainingRun {
-    /// A new run of `ranks`, or the run of `checkpoint` at its step. `device` has no autodiff.
+    /// A new run, or the run of `checkpoint` at its step, which the processes of `reduce` train
+    /// together. `device` has no autodiff.
     ///
     /// # Errors
     /// Scenes smaller than a patch; a checkpoint of another run; a `train.init` of another network.
     pub fn new(
         config: Config,
-        mut data: RunData,
+        data: RunData,
         dir: RunDir,
         checkpoint: Option<Checkpoint>,
-        device: &Device,
-        ranks: Ranks,
+        place: &SessionPlace,
     ) -> anyhow::Result<Self> {
-        let device = device.clone().autodiff();
-        let (model, albedo_filter, average, optimizer, state, initial) = match checkpoint {
-            Some(Checkpoint {
-                bundle,
-                average,
-                optimizer,
-                state,
-            }) => {
-                if let Some(ranges) = &bundle.meta.ranges {
-                    data.ranges = ranges.clone();
-                }
-                let expected = data.meta(config.model, state.step);
-                ensure!(
-                    bundle.meta == expected,
-                    "{}: network, layout or statistics of the checkpoint differ from this run's",
-                    dir.path().display()
-                );
-                ensure!(
-                    average.is_some() == config.train.ema_decay.is_some(),
-                    "{}: either the checkpoint or train.ema_decay has no weight average",
-                    dir.path().display()
-                );
-                let Bundle {
-                    model,
-                    albedo_filter,
-                    ..
-                } = bundle;
-                (model, albedo_filter, average, optimizer, state, None)
+        let mut data = data;
+        let device = place.device.clone().autodiff();
+        let reduce = place.reduce.clone();
+        let StartingPoint {
+            model,
+            albedo_filter,
+            average,
+            optimizer,
+            state,
+            initial,
+        } = match checkpoint {
+            Some(checkpoint) => {
+                StartingPoint::of_checkpoint(checkpoint, &config, &mut data, dir.path())?
             }
-            None => {
-                let InitialNetwork {
-                    model,
-                    albedo_filter,
-                    weights,
-                } = initial_network(&config, data.normalizer.flat_color, &device)?;
-                let before = weights.as_ref().and_then(|weights| weights.ranges.as_ref());
-                if let Some(before) = before {
-                    data.ranges = data.ranges.with(before);
-                }
-                (
-                    model,
-                    albedo_filter,
-                    None,
-                    Optimizer::new(&config),
-                    LoopState::start(),
-                    weights,
-                )
-            }
+            None => StartingPoint::of_new_run(&config, &mut data, &device)?,
         };
-        let source = data.patch_source(&config, ranks.on_node(), albedo_filter.as_deref())?;
-        let trainer = Trainer::new(&config, model, optimizer, average, device).on(ranks.clone());
+        let source = data.patch_source(&config, reduce.on_node(), albedo_filter.as_deref())?;
+        let trainer =
+            Trainer::new(&config, model, optimizer, average, device).with_reduce(reduce.clone());
         Ok(TrainingRun {
             config,
             data,
@@ -136,7 +162,7 @@ impl TrainingRun {
             state,
             initial,
             skipped_in_a_row: 0,
-            ranks,
+            reduce,
         })
     }
 
@@ -155,10 +181,11 @@ impl TrainingRun {
         self.source.patches().len()
     }
 
-    /// The estimated duration of the steps after `first_step` on this many ranks, without exchanges.
-    pub fn estimate(&self, first_step: u64, device: &Device, ranks: usize) -> DurationEstimate {
+    /// The estimated duration of the steps after `first_step` if so many processes share them, without
+    /// their exchanges.
+    pub fn estimate(&self, first_step: u64, device: &Device, processes: usize) -> DurationEstimate {
         let autodiff = device.clone().autodiff();
-        DurationEstimate::measure(&self.config, &self.data, first_step, &autodiff, ranks)
+        DurationEstimate::measure(&self.config, &self.data, first_step, &autodiff, processes)
     }
 
     /// Number of trainable parameters.
@@ -166,8 +193,8 @@ impl TrainingRun {
         self.config.model.parameter_count()
     }
 
-    /// Trains to the last step, or until `observer`, which hears of every step, returns a signal.
-    /// `device` is the name of the device for the record.
+    /// Trains to the last step, or until `observer`, which hears of every step, returns a signal: then
+    /// the result is `Some`. `device` is the name of the device for the record.
     ///
     /// # Errors
     /// A scene that cannot be read; a file that cannot be written; a non-finite loss in a step
@@ -176,21 +203,21 @@ impl TrainingRun {
         &mut self,
         device: &str,
         mut observer: impl FnMut(&TakenStep) -> Option<i32>,
-    ) -> anyhow::Result<LoopEnd> {
+    ) -> anyhow::Result<Option<Stopped>> {
         let mut recorder = self.open_records(device)?;
         let (train, run) = (self.config.train.clone(), self.config.run.clone());
         let rate = self.config.learning_rate();
         let scenes = self.data.train.iter();
         let scenes: Vec<String> = scenes.map(|scene| scene.name.clone()).collect();
         let per_step = train.grad_accumulation;
-        let source = self.source.clone();
-        let mut loader = rank_loader(source, &self.ranks, per_step, self.state.step);
+        let share = self.reduce.share(per_step);
+        let mut loader = share_loader(self.source.clone(), share, per_step, self.state.step);
         let mut clock = SessionClock::new(self.state.elapsed_s, run.checkpoint_interval());
         while self.state.step < train.steps {
             let lr = rate.at(self.state.step);
             let (report, time) = timed(|| self.trainer.step(lr, || loader.next()));
             let report = report?;
-            let exchange = self.ranks.take_time();
+            let exchange = self.reduce.take_time();
             let mut warnings = self.count(&report, lr, &scenes)?;
             let step = self.state.step;
             recorder.step(step, report.loss, time, exchange);
@@ -223,7 +250,7 @@ impl TrainingRun {
             }
             if let Some(signal) = signal.filter(|_| step < train.steps) {
                 recorder.finish();
-                return Ok(LoopEnd::Stopped { signal, step });
+                return Ok(Some(Stopped { signal, step }));
             }
         }
         recorder.finish();
@@ -233,13 +260,13 @@ impl TrainingRun {
              inspect the data with demc-data doctor, or try a smaller optimizer.lr_start",
             self.state.step
         );
-        Ok(LoopEnd::Done)
+        Ok(None)
     }
 
-    /// The first signal that a rank received, and whether rank 0's clock asks for a checkpoint. All
-    /// ranks get the same answer, so they stop after the same step.
+    /// The first signal that a process received, and whether the first process's clock asks for a
+    /// checkpoint. All processes get the same answer, so they stop after the same step.
     fn requests(&self, signal: Option<i32>, is_time: bool) -> anyhow::Result<(Option<i32>, bool)> {
-        let requests = self.ranks.gather(Ok((signal, is_time)))?;
+        let requests = self.reduce.gather(Ok((signal, is_time)))?;
         let signal = requests.iter().find_map(|(signal, _)| *signal);
         Ok((
             signal,
@@ -253,7 +280,7 @@ impl TrainingRun {
     }
 
     fn open_records(&mut self, device: &str) -> anyhow::Result<Recorder> {
-        if !self.ranks.is_first() {
+        if !self.reduce.is_first() {
             return Ok(Recorder::silent());
         }
         let facts = RunFacts {
@@ -327,9 +354,9 @@ impl TrainingRun {
         )
     }
 
-    /// Writes a checkpoint, on rank 0.
+    /// Writes a checkpoint, in the first process.
     fn save(&self) -> anyhow::Result<()> {
-        if !self.ranks.is_first() {
+        if !self.reduce.is_first() {
             return Ok(());
         }
         let bundle = self.bundle(self.trainer.model().valid());

@@ -11,7 +11,7 @@ use demc_infer::picture::Picture;
 use demc_model::config::DETAIL_CHANNELS;
 use serde::{Deserialize, Serialize};
 
-use crate::ranks::Ranks;
+use crate::ranks::Reduce;
 
 /// Number of scenes in the picture of a validation: always the first ones. Ours.
 pub const STRIP_SCENES: usize = 3;
@@ -56,8 +56,8 @@ struct SceneResult {
     picture: Option<Picture>,
 }
 
-/// Denoises and scores `scenes`, one at a time, and draws the first `strips` of them. The scenes are
-/// dealt out to `ranks`; each gets the whole result.
+/// Denoises and scores `scenes`, one at a time, and draws the first `strips` of them. The processes of
+/// `reduce` deal them out; each gets the whole result.
 ///
 /// # Errors
 /// A scene that cannot be read or has no reference.
@@ -65,16 +65,12 @@ pub fn score(
     bundle: &Bundle,
     scenes: &[Scene],
     strips: usize,
-    ranks: &Ranks,
+    reduce: &Reduce,
 ) -> anyhow::Result<Validation> {
-    let own = scenes.iter().enumerate();
-    let own = own.filter(|(index, _)| index % ranks.count() == ranks.rank());
-    let own: anyhow::Result<Vec<SceneResult>> = own
-        .map(|(index, scene)| score_scene(bundle, scene, index < strips))
-        .collect();
-    let mut dealt: Vec<_> = ranks.gather(own)?.into_iter().map(Vec::into_iter).collect();
-    let in_order = (0..scenes.len()).filter_map(|index| dealt[index % ranks.count()].next());
-    Ok(whole(in_order.collect()))
+    let results = reduce.deal(scenes, |index, scene| {
+        score_scene(bundle, scene, index < strips)
+    })?;
+    Ok(whole(results))
 }
 
 fn score_scene(bundle: &Bundle, scene: &Scene, draws: bool) -> anyhow::Result<SceneResult> {

@@ -1,8 +1,8 @@
-//! The gradient of a network as a whole: norm, clipping, sums, and exchange between ranks.
+//! The gradient of a network as a whole: norm and clipping.
 
 use burn::module::{Module, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
-use burn::tensor::{Tensor, TensorData};
+use burn::tensor::Tensor;
 use demc_model::Denoiser;
 use demc_model::ops::update::sum_of_squares;
 
@@ -43,74 +43,4 @@ pub fn scaled(model: &Denoiser, grads: GradientsParams, factor: f64) -> Gradient
     let mut scaler = GradientScaler { grads, factor };
     model.visit(&mut scaler);
     scaler.grads
-}
-
-/// The sum of two gradients of one network.
-pub fn added(model: &Denoiser, left: GradientsParams, right: GradientsParams) -> GradientsParams {
-    struct GradientAdder {
-        left: GradientsParams,
-        right: GradientsParams,
-    }
-    impl ModuleVisitor for GradientAdder {
-        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            let left = self.left.remove::<D>(param.id);
-            let right = self.right.remove::<D>(param.id);
-            let sum = match (left, right) {
-                (Some(left), Some(right)) => left + right,
-                (Some(only), None) | (None, Some(only)) => only,
-                (None, None) => return,
-            };
-            self.left.register(param.id, sum);
-        }
-    }
-    let mut adder = GradientAdder { left, right };
-    model.visit(&mut adder);
-    adder.left
-}
-
-/// The values of all gradients on the host, in module order.
-pub fn flattened(model: &Denoiser, grads: &GradientsParams) -> Vec<f32> {
-    struct Flattener<'a> {
-        grads: &'a GradientsParams,
-        values: Vec<f32>,
-    }
-    impl ModuleVisitor for Flattener<'_> {
-        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            if let Some(grad) = self.grads.get::<D>(param.id) {
-                let values = grad.into_data().try_to_vec::<f32>();
-                self.values.extend(values.expect("gradients are float32"));
-            }
-        }
-    }
-    let mut flattener = Flattener {
-        grads,
-        values: Vec::new(),
-    };
-    model.visit(&mut flattener);
-    flattener.values
-}
-
-/// `grads` with other values, in the order of [`flattened`].
-///
-/// # Panics
-/// If there are too few values.
-pub fn with_values(model: &Denoiser, grads: GradientsParams, values: &[f32]) -> GradientsParams {
-    struct Replacer<'a> {
-        grads: GradientsParams,
-        values: &'a [f32],
-    }
-    impl ModuleVisitor for Replacer<'_> {
-        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            if let Some(grad) = self.grads.remove::<D>(param.id) {
-                let (own, rest) = self.values.split_at(grad.dims().iter().product());
-                self.values = rest;
-                let data = TensorData::new(own.to_vec(), grad.dims());
-                let grad = Tensor::<D>::from_data(data, &grad.device());
-                self.grads.register(param.id, grad);
-            }
-        }
-    }
-    let mut replacer = Replacer { grads, values };
-    model.visit(&mut replacer);
-    replacer.grads
 }

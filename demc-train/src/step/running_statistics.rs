@@ -1,7 +1,7 @@
 //! Batch normalisation's running statistics: a snapshot, and their update in the order of the
 //! micro-batches.
 //!
-//! A forward pass updates them before the loss is known to be non-finite, and each rank sees its own
+//! A forward pass updates them before the loss is known to be non-finite, and each process sees its own
 //! micro-batches only. So a step starts each forward pass from zeros, collects the shares of all
 //! micro-batches, and adds them at its end.
 
@@ -36,13 +36,15 @@ impl RunningStatistics {
         RunningStatistics(zeros.collect())
     }
 
-    /// The values as bits, in module order.
-    pub fn bits(&self) -> Vec<u32> {
-        let values = self.0.iter().flat_map(|statistic| {
-            let values = statistic.to_data().try_to_vec::<f32>();
-            values.expect("statistics are float32")
-        });
-        values.map(f32::to_bits).collect()
+    /// The values in module order.
+    pub fn values(&self) -> Vec<f32> {
+        self.0
+            .iter()
+            .flat_map(|statistic| {
+                let values = statistic.to_data().try_to_vec::<f32>();
+                values.expect("statistics are float32")
+            })
+            .collect()
     }
 
     /// These statistics after batches with these shares, in order:
@@ -50,13 +52,13 @@ impl RunningStatistics {
     ///
     /// # Panics
     /// If a share has too few values.
-    pub fn updated<'a>(&self, shares: impl Iterator<Item = &'a [u32]>) -> Self {
+    pub fn updated<'a>(&self, shares: impl Iterator<Item = &'a [f32]>) -> Self {
         let kept = (1.0 - NORM_MOMENTUM) as f32;
-        let mut values: Vec<f32> = self.bits().into_iter().map(f32::from_bits).collect();
+        let mut values = self.values();
         for share in shares {
             assert_eq!(share.len(), values.len(), "the same network");
             for (value, share) in values.iter_mut().zip(share) {
-                *value = *value * kept + f32::from_bits(*share);
+                *value = *value * kept + share;
             }
         }
         let mut rest = values.as_slice();

@@ -9,10 +9,10 @@ use demc_model::{Denoiser, LossConfig};
 use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
-use crate::ranks::Ranks;
-use crate::ranks::tree::{Block, PairwiseSum};
+use crate::ranks::Reduce;
+use crate::ranks::gradients::GradientSum;
 use crate::step::ema::Ema;
-use crate::step::gradients::{added, flattened, grad_norm, scaled, with_values};
+use crate::step::gradients::{grad_norm, scaled};
 use crate::step::optimizer::{DORMANT_STEPS, DormantChannels, Optimizer};
 use crate::step::running_statistics::RunningStatistics;
 
@@ -31,24 +31,17 @@ pub struct Trainer {
     grad_accumulation: usize,
     max_grad_norm: Option<f32>,
     gamma: f32,
-    ranks: Ranks,
+    reduce: Reduce,
 }
 
-/// What every rank needs to know of a micro-batch.
+/// What a step needs to know of a micro-batch besides its gradient.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct MicroBatch {
-    /// Scene, y and x of each patch.
-    patches: Vec<(u32, u32, u32)>,
-    /// Loss of each patch, as bits: a loss may be infinite or NaN.
-    losses: Vec<u32>,
-    /// Its share in the running statistics, as bits.
-    statistics: Vec<u32>,
-}
-
-/// This rank's part of a step.
-struct OwnPart {
-    batches: Vec<MicroBatch>,
-    gradients: PairwiseSum<GradientsParams>,
+    patches: Vec<Patch>,
+    /// Loss of each patch.
+    losses: Vec<f32>,
+    /// Its share in the running statistics.
+    statistics: Vec<f32>,
 }
 
 /// The result of one optimizer step.
@@ -65,14 +58,11 @@ pub struct StepReport {
 impl StepReport {
     /// The report of a step on `batches`, without a gradient so far.
     fn of(batches: &[MicroBatch]) -> Self {
-        let patches = batches.iter().flat_map(|batch| {
-            let losses = batch.losses.iter().map(|bits| f32::from_bits(*bits));
-            let patches = batch.patches.iter();
-            patches
-                .map(|&(scene, y, x)| Patch { scene, y, x })
-                .zip(losses.map(f64::from))
-        });
-        let patches: Vec<_> = patches.collect();
+        let patches: Vec<(Patch, f64)> = batches
+            .iter()
+            .flat_map(|batch| batch.patches.iter().zip(&batch.losses))
+            .map(|(patch, loss)| (*patch, f64::from(*loss)))
+            .collect();
         StepReport {
             loss: patches.iter().map(|(_, loss)| loss).sum::<f64>() / patches.len() as f64,
             grad_norm: f64::NAN,
@@ -135,13 +125,13 @@ impl Trainer {
             grad_accumulation: config.train.grad_accumulation,
             max_grad_norm: config.optimizer.max_grad_norm,
             gamma: config.data.gamma,
-            ranks: Ranks::default(),
+            reduce: Reduce::default(),
         }
     }
 
-    /// The trainer of one of `ranks`, which take every step together.
-    pub fn on(self, ranks: Ranks) -> Self {
-        Trainer { ranks, ..self }
+    /// A trainer that takes every step together with those of other processes.
+    pub fn with_reduce(self, reduce: Reduce) -> Self {
+        Trainer { reduce, ..self }
     }
 
     /// Takes this many batches per step from now on, for measurements.
@@ -180,112 +170,88 @@ impl Trainer {
     }
 
     /// Takes one step at learning rate `lr` on `train.grad_accumulation` batches. `next_batch` gives
-    /// those of this rank's share.
+    /// those of this process's share.
     ///
     /// If loss or gradient are not finite, the step is skipped: network and running statistics stay
     /// as they were.
     ///
     /// # Errors
-    /// Those of `next_batch` on any rank; the weights stay as they were.
+    /// Those of `next_batch` in any process; the weights stay as they were.
     pub fn step<E: Into<anyhow::Error>>(
         &mut self,
         lr: f64,
         next_batch: impl FnMut() -> Result<Batch, E>,
     ) -> anyhow::Result<StepReport> {
         let before = RunningStatistics::of(self.model(), self.optimizer.specs());
-        let own = self.own_part(&before, next_batch);
-        let (batches, gradients) = match own {
-            Ok(part) => (Ok(part.batches), Some(part.gradients)),
-            Err(error) => (Err(error), None),
-        };
-        let batches = match self.ranks.gather(batches) {
-            Ok(batches) => batches.into_iter().flatten().collect::<Vec<_>>(),
-            Err(error) => {
-                self.set_statistics(before);
-                return Err(error);
-            }
-        };
+        let report = self.step_from(&before, lr, next_batch);
+        if !report.as_ref().is_ok_and(StepReport::is_finite) {
+            self.set_statistics(before);
+        }
+        report
+    }
+
+    /// As [`step`](Self::step), but without its guarantee about the running statistics.
+    fn step_from<E: Into<anyhow::Error>>(
+        &mut self,
+        before: &RunningStatistics,
+        lr: f64,
+        mut next_batch: impl FnMut() -> Result<Batch, E>,
+    ) -> anyhow::Result<StepReport> {
+        let mut gradients = GradientSum::default();
+        let share = self.reduce.share(self.grad_accumulation);
+        let own: anyhow::Result<Vec<MicroBatch>> = share
+            .map(|number| {
+                let batch = next_batch().map_err(Into::into)?;
+                // From zeros, they become this micro-batch's share alone.
+                self.set_statistics(before.zeros());
+                Ok(self.forward_and_backward(batch, number, &mut gradients))
+            })
+            .collect();
+        let batches = self.reduce.concat(own)?;
         let mut report = StepReport::of(&batches);
         if report.loss.is_finite()
-            && let Some(gradients) = gradients.and_then(|own| self.summed(own))
+            && let Some(gradient) = self
+                .reduce
+                .sum(self.model(), gradients, self.grad_accumulation)
         {
-            report.grad_norm = grad_norm(self.model(), &gradients);
+            report.grad_norm = grad_norm(self.model(), &gradient);
             if report.is_finite() {
                 let shares = batches.iter().map(|batch| batch.statistics.as_slice());
                 self.set_statistics(before.updated(shares));
-                self.update(lr, gradients, report.grad_norm);
-                return Ok(report);
+                self.update(lr, gradient, report.grad_norm);
             }
         }
-        self.set_statistics(before);
         Ok(report)
     }
 
-    /// Forward and backward pass of this rank's micro-batches.
-    fn own_part<E: Into<anyhow::Error>>(
-        &mut self,
-        before: &RunningStatistics,
-        mut next_batch: impl FnMut() -> Result<Batch, E>,
-    ) -> anyhow::Result<OwnPart> {
-        let mut part = OwnPart {
-            batches: Vec::new(),
-            gradients: PairwiseSum::default(),
-        };
-        let mut is_finite = true;
-        for number in self.ranks.share(self.grad_accumulation) {
-            let mut batch = next_batch().map_err(Into::into)?;
-            let patches = std::mem::take(&mut batch.patches);
-            // From zero, they become this batch's share alone.
-            self.set_statistics(before.zeros());
-            let batch_losses = self.losses(batch);
-            let mean = batch_losses
-                .clone()
-                .mean()
-                .div_scalar(self.grad_accumulation as f32);
-            let losses = batch_losses.into_data().try_to_vec::<f32>();
-            let losses = losses.expect("losses are float32");
-            assert_eq!(patches.len(), losses.len(), "a place for each loss");
-            is_finite &= losses.iter().all(|loss| loss.is_finite());
-            if is_finite {
-                let model = self.model();
-                let block = Block {
-                    first: number,
-                    terms: 1,
-                    sum: GradientsParams::from_grads(mean.backward(), model),
-                };
-                part.gradients
-                    .push(block, |left, right| added(model, left, right));
-            }
-            let statistics = RunningStatistics::of(self.model(), self.optimizer.specs());
-            part.batches.push(MicroBatch {
-                patches: patches.iter().map(|p| (p.scene, p.y, p.x)).collect(),
-                losses: losses.into_iter().map(f32::to_bits).collect(),
-                statistics: statistics.bits(),
-            });
+    /// Losses of the micro-batch `number`, and its share of the gradient of their mean, which is
+    /// added to `gradients` if the losses are finite.
+    fn forward_and_backward(
+        &self,
+        mut batch: Batch,
+        number: usize,
+        gradients: &mut GradientSum,
+    ) -> MicroBatch {
+        let patches = std::mem::take(&mut batch.patches);
+        let tensor = self.losses(batch);
+        let mean = tensor
+            .clone()
+            .mean()
+            .div_scalar(self.grad_accumulation as f32);
+        let losses = tensor.into_data().try_to_vec::<f32>();
+        let losses = losses.expect("losses are float32");
+        assert_eq!(patches.len(), losses.len(), "a place for each loss");
+        if losses.iter().all(|loss| loss.is_finite()) {
+            let model = self.model();
+            let gradient = GradientsParams::from_grads(mean.backward(), model);
+            gradients.add(model, number, gradient);
         }
-        Ok(part)
-    }
-
-    /// The sum of the gradients of all micro-batches of all ranks.
-    fn summed(&self, own: PairwiseSum<GradientsParams>) -> Option<GradientsParams> {
-        let model = self.model();
-        if self.ranks.count() == 1 {
-            return own.total(|left, right| added(model, left, right));
+        let statistics = RunningStatistics::of(self.model(), self.optimizer.specs());
+        MicroBatch {
+            patches,
+            losses,
+            statistics: statistics.values(),
         }
-        let mut shape = None;
-        let blocks = own.into_blocks().into_iter().map(|block| {
-            let Block { first, terms, sum } = block;
-            let values = flattened(model, &sum);
-            shape.get_or_insert(sum);
-            Block {
-                first,
-                terms,
-                sum: values,
-            }
-        });
-        let blocks = blocks.collect();
-        let values = self.ranks.sum(blocks, self.grad_accumulation)?;
-        Some(with_values(model, shape?, &values))
     }
 
     fn set_statistics(&mut self, statistics: RunningStatistics) {
@@ -300,20 +266,14 @@ impl Trainer {
         late.then(|| self.optimizer.dormant())
     }
 
-    /// The mean loss of this rank's batches and those of the other ranks, without a step.
+    /// The mean loss of the batches of all processes, of which these are this one's, without a step.
     ///
     /// # Errors
-    /// A failed exchange between ranks.
+    /// A failed exchange between processes.
     pub fn mean_loss(&self, batches: impl Iterator<Item = Batch>) -> anyhow::Result<f64> {
-        let losses = batches.map(|batch| self.losses(batch).mean().into_scalar::<f32>().to_bits());
-        let losses = self
-            .ranks
-            .gather(Ok(losses.collect::<Vec<u32>>()))?
-            .concat();
-        let sum: f64 = losses
-            .iter()
-            .map(|bits| f64::from(f32::from_bits(*bits)))
-            .sum();
+        let own = batches.map(|batch| self.losses(batch).mean().into_scalar::<f32>());
+        let losses = self.reduce.concat(Ok(own.collect()))?;
+        let sum: f64 = losses.iter().copied().map(f64::from).sum();
         Ok(sum / losses.len() as f64)
     }
 

@@ -9,19 +9,18 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context;
-use burn::tensor::Device;
 use demc_data::Batch;
 use demc_program::file::write_whole;
 
 use crate::config::Config;
-use crate::ranks::Ranks;
-use crate::run::data::{RunData, rank_loader};
+use crate::run::data::{RunData, share_loader};
+use crate::run::estimate::check_memory;
 use crate::run::initial::{InitialNetwork, initial_network};
+use crate::run::place::SessionPlace;
 use crate::step::optimizer::Optimizer;
 use crate::step::trainer::Trainer;
 use crate::tools::chart::figure::{AxisScale, Figure, LinePanel, Series};
 use crate::tools::chart::with_extension;
-use crate::tools::estimate::check_memory;
 
 /// Weight of the previous value in the smoothed ratio; ours.
 const SMOOTH: f64 = 0.9;
@@ -73,7 +72,7 @@ pub struct Sweep {
 }
 
 /// Sweeps over `range` with network, batches and optimizer of `config`, and calls `on_step` after
-/// each step. `device` has no autodiff.
+/// each step.
 ///
 /// # Errors
 /// A scene that cannot be read; a `train.init` of another network.
@@ -81,32 +80,32 @@ pub fn sweep(
     config: &Config,
     data: &RunData,
     range: RateRange,
-    device: &Device,
-    ranks: &Ranks,
+    place: &SessionPlace,
     mut on_step: impl FnMut(&SweepPoint),
 ) -> anyhow::Result<Sweep> {
-    check_memory(config, device, ranks.on_node().count)?;
-    let device = device.clone().autodiff();
+    let reduce = &place.reduce;
+    check_memory(config, &place.device, reduce.on_node().count)?;
+    let device = place.device.clone().autodiff();
     let network = || initial_network(config, data.normalizer.flat_color, &device);
     let InitialNetwork {
         model,
         albedo_filter,
         ..
     } = network()?;
-    let source = data.patch_source(config, ranks.on_node(), albedo_filter.as_deref())?;
+    let source = data.patch_source(config, reduce.on_node(), albedo_filter.as_deref())?;
     let per_step = config.train.grad_accumulation;
-    let mut loader = rank_loader(Arc::new(source), ranks, per_step, 0);
-    let own = ranks.share(per_step);
+    let own = reduce.share(per_step);
+    let mut loader = share_loader(Arc::new(source), own.clone(), per_step, 0);
     let trainer = |model| {
         let optimizer = Optimizer::new(config);
-        Trainer::new(config, model, optimizer, None, device.clone()).on(ranks.clone())
+        Trainer::new(config, model, optimizer, None, device.clone()).with_reduce(reduce.clone())
     };
     let (mut trained, untrained) = (trainer(model), trainer(network()?.model));
     let mut ratios = SweepRatios::default();
     for step in 0..range.steps {
         let batches: Result<Vec<Batch>, demc_data::Error> =
             own.clone().map(|_| loader.next()).collect();
-        let batches = ranks.agree(batches.map_err(Into::into))?;
+        let batches = reduce.agree(batches.map_err(Into::into))?;
         let before = untrained.mean_loss(batches.iter().cloned())?;
         let lr = range.rate(step);
         let mut next = batches.into_iter();

@@ -1,7 +1,6 @@
-//! Tools beside training: ablation, learning-rate finder, curves, estimate of the duration.
+//! Tools beside training: ablation, learning-rate finder, curves.
 
 pub mod ablation;
 pub mod chart;
-pub mod estimate;
 pub mod find_lr;
 pub mod plot;

@@ -119,9 +119,6 @@ fn invalid_configurations_exit_with_2_and_one_line() {
         "both problems: {all}"
     );
 
-    let old = error("train.muon=64");
-    assert!(old.contains("optimizer.muon_max_rows"), "{old}");
-
     let misspelt = dir.path().join("misspelt.toml");
     fs::write(&misspelt, "[model]\n\nwidht = 3\n").expect("a file");
     let error = error_line(&train(&misspelt, &run, &[]), 2);

@@ -12,6 +12,15 @@ use crate::run::checkpoint::BestValidation;
 use crate::run::run_dir::SCORES;
 use crate::run::validation::{self, Validation};
 
+/// Scores of the test split.
+#[derive(Clone, Debug)]
+pub struct TestScores {
+    /// The step of the weights.
+    pub step: u64,
+    /// The scores.
+    pub report: Report,
+}
+
 impl TrainingRun {
     /// Scores and draws the validation scenes, and keeps the weights if they are the best so far.
     pub(super) fn validate(
@@ -23,7 +32,7 @@ impl TrainingRun {
         }
         let bundle = self.bundle(self.trainer.result());
         let strips = validation::STRIP_SCENES;
-        let found = validation::score(&bundle, &self.data.validation, strips, &self.ranks)
+        let found = validation::score(&bundle, &self.data.validation, strips, &self.reduce)
             .context("validation")?;
         let step = self.state.step;
         if let Some(picture) = &found.picture {
@@ -31,7 +40,7 @@ impl TrainingRun {
         }
         let relmse = found.report.mean.denoised.relmse;
         if self.state.best.is_none_or(|best| relmse < best.relmse) {
-            if self.ranks.is_first() {
+            if self.reduce.is_first() {
                 bundle.save(&self.dir.path().join(BEST), Names::Burn, Precision::F32)?;
             }
             self.state.best = Some(BestValidation { step, relmse });
@@ -44,7 +53,7 @@ impl TrainingRun {
     ///
     /// # Errors
     /// A scene that cannot be read; a file that cannot be written.
-    pub fn test(&self, device: &Device) -> anyhow::Result<Option<(u64, Report)>> {
+    pub fn test(&self, device: &Device) -> anyhow::Result<Option<TestScores>> {
         if self.data.test.is_empty() {
             return Ok(None);
         }
@@ -54,15 +63,18 @@ impl TrainingRun {
         };
         let Validation {
             report, picture, ..
-        } = validation::score(&bundle, &self.data.test, usize::MAX, &self.ranks).context("test")?;
-        if !self.ranks.is_first() {
-            return Ok(Some((bundle.meta.step, report)));
+        } = validation::score(&bundle, &self.data.test, usize::MAX, &self.reduce)
+            .context("test")?;
+        if self.reduce.is_first() {
+            if let Some(picture) = picture {
+                validation::write_strip(self.dir.path(), "test.png", &picture)?;
+            }
+            self.dir
+                .write(SCORES, &serde_json::to_vec_pretty(&report)?)?;
         }
-        if let Some(picture) = picture {
-            validation::write_strip(self.dir.path(), "test.png", &picture)?;
-        }
-        self.dir
-            .write(SCORES, &serde_json::to_vec_pretty(&report)?)?;
-        Ok(Some((bundle.meta.step, report)))
+        Ok(Some(TestScores {
+            step: bundle.meta.step,
+            report,
+        }))
     }
 }

@@ -75,7 +75,7 @@ fn the_output_is_modulated_before_the_loss() {
             .collect(),
         ..plain.clone()
     };
-    let mean = |batch: Batch| trainer.mean_loss([batch].into_iter()).expect("one rank");
+    let mean = |batch: Batch| trainer.mean_loss([batch].into_iter()).expect("one process");
     let [plain, twice] = [plain, twice].map(mean);
     assert!(
         plain > 0.0 && (twice / plain - 2.0).abs() < 1e-5,

@@ -12,8 +12,7 @@ mod table;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
-use demc_program::message;
+use anyhow::{Context, ensure};
 use demc_program::output::{Directories, Outputs};
 
 use crate::config::Config;
@@ -22,24 +21,12 @@ use crate::record::progress::say;
 use crate::run::checkpoint::store::CheckpointStore;
 use crate::run::data::protect_inputs;
 use crate::run::initial::read_init;
+use crate::run::place::SessionPlace;
 use crate::run::run_dir::SCORES;
-use crate::run::session::{Session, SessionOptions, SessionOutcome, SessionPlace};
+use crate::run::session::{Session, SessionOptions};
+use crate::run::signals::{Outcome, Stopped};
 use comparison::{Comparison, FinishedRun};
 use spec::AblationSpec;
-
-/// How an ablation ended.
-#[derive(Debug)]
-pub enum AblationOutcome {
-    /// Every run is complete. Rank 0 has the comparison.
-    Done(Option<Box<Comparison>>),
-    /// A signal stopped it; everything is saved.
-    Stopped {
-        /// The signal.
-        signal: i32,
-        /// The last step of the current run.
-        step: u64,
-    },
-}
 
 /// One run of an ablation.
 struct PlannedRun {
@@ -48,53 +35,41 @@ struct PlannedRun {
     config: Config,
 }
 
-/// Trains every run of `spec` that is not complete, and compares them.
-///
-/// Groups of ranks train different runs at the same time. Rank 0 of each group prints.
+/// Trains every run of `spec` that is not complete, and compares them. The processes of `place` train
+/// several runs at the same time. The first process has the comparison.
 ///
 /// # Errors
 /// Before any training: a `train.init` of another network, or a result that would replace an input
 /// or cannot be written. Later: a run that cannot be trained or read; no test split.
-pub fn run(spec: &AblationSpec, place: &SessionPlace) -> anyhow::Result<AblationOutcome> {
-    let world = &place.ranks;
+pub fn run(
+    spec: &AblationSpec,
+    place: &SessionPlace,
+) -> anyhow::Result<Outcome<Option<Box<Comparison>>>> {
+    let reduce = &place.reduce;
     let planned = planned(spec);
-    let missing = world.from_first(|| {
+    let missing = reduce.from_first(|| {
         check_init(spec)?;
         check_outputs(spec)?;
         missing(&planned)
     })?;
-    let size = group_size(spec, world.count(), missing.len());
-    let (group, number) = world.split(size);
-    let groups = world.count() / size;
-    let own = missing.iter().skip(number).step_by(groups);
-    // Ranks that are too few for a group wait.
-    let own = own.take(if number < groups { usize::MAX } else { 0 });
-    message::silence(!group.is_first());
-    let place = SessionPlace {
-        ranks: group,
-        ..place.clone()
+    let divides_steps = |size: usize| {
+        let mut variants = spec.variants.iter();
+        variants.all(|variant| variant.config.train.grad_accumulation.is_multiple_of(size))
     };
-    let mut stopped = None;
-    for run in own.map(|index| &planned[*index]) {
-        let end = train(spec, run, &place).with_context(|| run.name.clone());
-        // The other groups do not know of an error.
-        stopped = end.map_err(|error| match groups {
-            1 => error,
-            _ => anyhow::anyhow!("{error:#}"),
-        })?;
-        if stopped.is_some() {
-            break;
-        }
+    let stopped = reduce.in_groups(&missing, divides_steps, |group, index| {
+        let run = &planned[*index];
+        let place = SessionPlace {
+            reduce: group.clone(),
+            ..place.clone()
+        };
+        train(spec, run, &place).with_context(|| run.name.clone())
+    })?;
+    if let Some(stopped) = stopped {
+        return Ok(Outcome::Stopped(stopped));
     }
-    let stopped = world.gather(Ok(stopped))?.into_iter().flatten().next();
-    message::silence(!world.is_first());
-    if let Some((signal, step)) = stopped {
-        return Ok(AblationOutcome::Stopped { signal, step });
-    }
-    let comparison = world.is_first().then(|| compared(spec, &planned));
-    Ok(AblationOutcome::Done(
-        world.agree(comparison.transpose())?.map(Box::new),
-    ))
+    let comparison = reduce.is_first().then(|| compared(spec, &planned));
+    let comparison = reduce.agree(comparison.transpose())?;
+    Ok(Outcome::Complete(comparison.map(Box::new)))
 }
 
 /// All runs, seed by seed.
@@ -127,24 +102,12 @@ fn missing(planned: &[PlannedRun]) -> anyhow::Result<Vec<usize>> {
     Ok(missing)
 }
 
-/// Ranks per run: as many as there are for each of `missing` runs, but a divisor of every variant's
-/// `train.grad_accumulation`.
-fn group_size(spec: &AblationSpec, ranks: usize, missing: usize) -> usize {
-    let most = (ranks / missing.max(1)).max(1);
-    let divides = |size: &usize| {
-        let variants = spec.variants.iter();
-        let mut counts = variants.map(|variant| variant.config.train.grad_accumulation);
-        counts.all(|count| count.is_multiple_of(*size))
-    };
-    (1..=most).rev().find(divides).unwrap_or(1)
-}
-
-/// Trains a run. Returns the signal and the step if it was stopped.
+/// Trains a run. Returns the signal if one stopped it.
 fn train(
     spec: &AblationSpec,
     run: &PlannedRun,
     place: &SessionPlace,
-) -> anyhow::Result<Option<(i32, u64)>> {
+) -> anyhow::Result<Option<Stopped>> {
     let options = SessionOptions {
         resume: true,
         check: false,
@@ -161,14 +124,17 @@ fn train(
     for note in &session.notes {
         say(format!("note: {note}"));
     }
-    Ok(match session.finish()? {
-        SessionOutcome::Stopped { signal, step } => Some((signal, step)),
-        SessionOutcome::Complete { scores: None, .. } => {
+    match session.finish()? {
+        Outcome::Stopped(stopped) => Ok(Some(stopped)),
+        Outcome::Complete(finished) => {
             let dir = run.config.run_dir().display();
-            anyhow::bail!("{dir}: no test split to compare on")
+            ensure!(
+                finished.scores.is_some(),
+                "{dir}: no test split to compare on"
+            );
+            Ok(None)
         }
-        SessionOutcome::Complete { .. } => None,
-    })
+    }
 }
 
 /// The comparison of complete runs.
@@ -215,7 +181,7 @@ fn finished(config: &Config) -> anyhow::Result<Option<FinishedRun>> {
     }
     let saved = Config::load(&dir.join("config.toml"), &[])?;
     let differences = config.differences(&saved);
-    anyhow::ensure!(
+    ensure!(
         differences.is_empty(),
         "{}: contains a run with another configuration: {}",
         dir.display(),

@@ -9,6 +9,7 @@ use burn::tensor::Device;
 use demc_data::{Batch, FEATURES};
 use demc_infer::memory;
 use demc_model::config::COLOR_CHANNELS;
+use demc_program::message::duration;
 
 use crate::config::Config;
 use crate::run::data::RunData;
@@ -42,7 +43,8 @@ pub struct DurationEstimate {
 }
 
 impl DurationEstimate {
-    /// Estimates the time of the steps after `first_step` on `ranks` ranks, without their exchanges.
+    /// Estimates the time of the steps after `first_step` if `processes` share them, without their
+    /// exchanges.
     ///
     /// It times steps on one patch and on four, which gives the time per patch and the constant
     /// time per step. With `data.batch_size = 1` the four are micro-batches.
@@ -51,7 +53,7 @@ impl DurationEstimate {
         data: &RunData,
         first_step: u64,
         device: &Device,
-        ranks: usize,
+        processes: usize,
     ) -> Self {
         let mut single = config.clone();
         single.train.grad_accumulation = 1;
@@ -98,9 +100,9 @@ impl DurationEstimate {
             .map(|scene| scene.width * scene.height)
             .sum();
         let patches = pixels as f64 / (config.data.patch_size * config.data.patch_size) as f64;
-        let own_patches = config.patches_per_step() / ranks as u64;
+        let own_patches = config.patches_per_step() / processes as u64;
         let step = one + patch_time * (own_patches - 1) as f64;
-        let validation = patch_time * patches * FORWARD_SHARE / ranks as f64;
+        let validation = patch_time * patches * FORWARD_SHARE / processes as f64;
         let steps = config.train.steps.saturating_sub(first_step) as f64;
         let remaining = steps * (step + validation / config.run.validate_every as f64);
         DurationEstimate {
@@ -108,44 +110,6 @@ impl DurationEstimate {
             validation,
             remaining,
         }
-    }
-}
-
-/// Seconds per message between two nodes. Ours: measured over TCP by benches/scaling.py.
-const LATENCY: f64 = 5e-5;
-
-/// A model of a step on a cluster, with one rank per node like this computer.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ClusterEstimate {
-    /// Ranks.
-    pub ranks: usize,
-    /// Seconds of forward and backward pass.
-    pub compute: f64,
-    /// Seconds of the exchange.
-    pub exchange: f64,
-    /// Bytes that each rank sends.
-    pub bytes: f64,
-}
-
-impl ClusterEstimate {
-    /// The model for `estimate`, whose time per step is that of one rank with its share, and a network
-    /// of this many bytes per second.
-    ///
-    /// Each rank sends a slice of its gradient to each other rank, and then the sum of its own slice.
-    pub fn new(estimate: &DurationEstimate, floats: u64, ranks: usize, bandwidth: f64) -> Self {
-        let others = (ranks - 1) as f64;
-        let bytes = 2.0 * others / ranks as f64 * (floats * 4) as f64;
-        ClusterEstimate {
-            ranks,
-            compute: estimate.step,
-            exchange: 2.0 * others * LATENCY + bytes / bandwidth,
-            bytes,
-        }
-    }
-
-    /// Seconds of a step.
-    pub fn step(&self) -> f64 {
-        self.compute + self.exchange
     }
 }
 
@@ -201,35 +165,9 @@ impl fmt::Display for DurationEstimate {
         write!(
             f,
             "about {} ({} per step)",
-            human(self.remaining),
-            human(self.step)
+            duration(self.remaining),
+            duration(self.step)
         )
-    }
-}
-
-/// `3 days 4 h`, `2 h 5 min`, `3 min 20 s`, `4.2 s`, `250 ms`: at most two units.
-impl fmt::Display for ClusterEstimate {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            f,
-            "model of {} ranks, one per node like this one: {} per step, {:.0} % of it exchange; each rank sends {:.1} MB",
-            self.ranks,
-            human(self.step()),
-            100.0 * self.exchange / self.step(),
-            self.bytes / 1e6
-        )
-    }
-}
-
-fn human(duration: f64) -> String {
-    let seconds = duration as u64;
-    let (days, hours, minutes) = (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60);
-    match (days, hours, minutes) {
-        (0, 0, 0) if duration < 1.0 => format!("{:.0} ms", 1000.0 * duration),
-        (0, 0, 0) => format!("{duration:.1} s"),
-        (0, 0, _) => format!("{minutes} min {} s", seconds % 60),
-        (0, _, _) => format!("{hours} h {minutes} min"),
-        _ => format!("{days} days {hours} h"),
     }
 }
 
@@ -244,14 +182,5 @@ mod tests {
         assert_eq!(patch_time(0.15, 1, 0.15), 0.15);
         assert_eq!(patch_time(0.2, 4, 0.1), 0.1 * 0.2);
         assert_eq!(patch_time(0.2, 2, 0.9), 0.2);
-    }
-
-    #[test]
-    fn durations_have_at_most_two_units() {
-        assert_eq!(human(0.25), "250 ms");
-        assert_eq!(human(4.24), "4.2 s");
-        assert_eq!(human(200.0), "3 min 20 s");
-        assert_eq!(human(7500.0), "2 h 5 min");
-        assert_eq!(human(273_700.0), "3 days 4 h");
     }
 }
