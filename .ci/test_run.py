@@ -51,7 +51,7 @@ class Checks(unittest.TestCase):
         self.addCleanup(folder.cleanup)
         self.root = Path(folder.name)
         (self.root / ".ci").mkdir()
-        for name in ("run", "prelude.sh", "docs.py"):
+        for name in ("run", "checks.py", "prelude.sh", "docs.py"):
             shutil.copy(HERE / name, self.root / ".ci" / name)
         for path, text in {
             "Cargo.toml": '[workspace]\nmembers = ["one", "two"]\n',
@@ -92,7 +92,7 @@ class Checks(unittest.TestCase):
         """The exit code, what ran, and the output."""
         (self.root / "ran").unlink(missing_ok=True)
         environment = {"PATH": os.environ["PATH"], "DEMC_CACHE": str(self.root / "cache"), "HOME": str(self.root)}
-        done = subprocess.run([self.root / ".ci/run", *arguments], env=environment, text=True, capture_output=True)
+        done = subprocess.run(["bash", self.root / ".ci/run", *arguments], env=environment, text=True, capture_output=True)
         ran = self.root / "ran"
         return done.returncode, ran.read_text().split() if ran.exists() else [], done.stdout + done.stderr
 
