@@ -21,6 +21,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import tomllib
 from fnmatch import fnmatch
@@ -191,8 +192,8 @@ class Run:
             print(f"== FAILED: {', '.join(self.failed)}", flush=True)
 
 
-def environment(files):
-    """The environment of the sections."""
+def environment(files, temporary):
+    """The environment of the sections, which share the directory `temporary`."""
     cache = Path(os.environ.get("DEMC_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "demc")
     build = cache / "build"
     if build.exists():
@@ -203,6 +204,8 @@ def environment(files):
     build.mkdir(parents=True, exist_ok=True)
     return os.environ | {
         "CARGO_BUILD_BUILD_DIR": str(build), "CARGO_TERM_COLOR": "never", "DEMC_CACHE": str(cache),
+        # Without a GPU, Mesa warns on stderr if this directory is not set.
+        "XDG_RUNTIME_DIR": os.environ.get("XDG_RUNTIME_DIR", temporary),
         "DEMC_CHANGED_CRATES": " ".join(changed_crates(files)),
     }
 
@@ -247,7 +250,8 @@ def main():
         case _:
             chosen = [section.name for section in sections.values() if section.required]
             optional = [name for name in touched(sections, files) if name not in chosen and not sections[name].fast]
-    run = Run(sections, environment(files))
+    temporary = tempfile.TemporaryDirectory()
+    run = Run(sections, environment(files, temporary.name))
     for name in [*chosen, *optional]:
         if name in run.passed:
             continue

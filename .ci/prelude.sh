@@ -2,8 +2,6 @@
 export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
 # Packages are kept once, in virtual environments, not in a cache as well: PyTorch's CUDA libraries are 3 GB.
 export PIP_NO_CACHE_DIR=1 PIP_QUIET=1
-# Without a GPU, Mesa looks for this directory and warns on stderr if it is not set.
-export XDG_RUNTIME_DIR="${XDG_RUNTIME_DIR:-$(mktemp -d)}"
 export PATH="$PWD/target/release:$PWD/.venv/bin:$PATH"
 # 30 steps of the kernel head spread fireflies; 200 steps suffice to be scored.
 quick='s/configs\/quickstart.toml/& --set train.steps=200/'

@@ -76,12 +76,12 @@ class Content(Attack):
                     self.assert_refused(sweep, "no training scene can be learned from")
 
     def test_18_a_tiny_loss(self):
-        """Scenes with content, of which no patch is lit: the loss is nearly 0."""
-        corner = lambda x, y: float(x == y == 63)
+        """Scenes of which one dark pixel is not black: the loss is nearly 0."""
+        corner = lambda x, y: 1e-3 * (x == y == 63)
         for name in ("one", "two", "three", "four"):
             write_exr(self.data / f"{name}.exr", R=corner, G=0.0, B=0.0, ref=corner)
         self.list(*((name, "train", name) for name in ("one", "two", "three", "four")))
-        result = self.train("--set", "train.steps=300", "--set", "run.log_every=300", "--set", "data.validation=0", "--set", "data.stride=32")
+        result = self.train("--set", "train.steps=300", "--set", "run.log_every=300", "--set", "data.validation=0")
         self.assertEqual(result.code, 0, result)
         for words in ("NaN", "brings", "0.0000 over"):
             self.assertNotIn(words, result.stdout)

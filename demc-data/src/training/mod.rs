@@ -1,8 +1,14 @@
 //! From the scenes of a data set to batches of training patches.
 //!
-//! [`config`] has the settings, [`stats`] measures the training scenes, [`patch`] lists the patches,
-//! [`cache`] holds decoded scenes, [`augment`], [`dropout`] and [`resample`] vary patches, [`batch`]
-//! computes a batch, and [`loader`] prepares batches on threads.
+//! | module | contents |
+//! |---|---|
+//! | [`config`] | the settings |
+//! | [`stats`] | statistics of the training scenes |
+//! | [`patch`] | the grid of patches, and their order |
+//! | [`cache`] | decoded scenes |
+//! | [`augment`], [`dropout`], [`resample`] | variations of a patch |
+//! | [`batch`] | one batch |
+//! | [`loader`] | batches ahead of time, on threads |
 
 pub mod augment;
 pub mod batch;

@@ -6,7 +6,7 @@ use mpi::environment::{Universe, processor_name};
 use mpi::topology::{Color, SimpleCommunicator};
 use mpi::traits::{Communicator, CommunicatorCollectives};
 
-use super::NodeShare;
+use super::placement::NodeShare;
 
 /// A group of ranks.
 pub(super) struct Group {

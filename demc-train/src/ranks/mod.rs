@@ -17,6 +17,7 @@ mod group;
 pub mod groups;
 pub mod launch;
 mod placement;
+mod sum;
 pub mod tree;
 
 use std::cell::Cell;
@@ -31,8 +32,8 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use group::Group;
-use placement::{Place, Placement};
-use tree::{Block, PairwiseSum};
+pub use placement::NodeShare;
+use placement::{ALONE, Place, Placement};
 
 /// The exchange between the ranks of one run; by default a single rank. Clones share it.
 ///
@@ -48,18 +49,6 @@ pub struct Reduce {
 
 /// The exit code that a program has for an error.
 pub type ExitCode = fn(&anyhow::Error) -> u8;
-
-/// A process among those of its node.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct NodeShare {
-    /// From 0.
-    pub index: usize,
-    /// At least 1.
-    pub count: usize,
-}
-
-/// A process without others on its node.
-const ALONE: NodeShare = NodeShare { index: 0, count: 1 };
 
 /// An error that all ranks know of. Rank 0 prints it.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -311,22 +300,6 @@ impl Reduce {
         self.agree(check_divides(self.count(), grad_accumulation))
     }
 
-    /// Sums vectors over all `terms` terms of all ranks in the order of [`PairwiseSum`]. `blocks` are
-    /// the sums of this rank's share of the terms.
-    ///
-    /// # Shapes
-    /// All sums have the same length, which is that of the result.
-    fn sum_blocks(&self, blocks: Vec<Block<Vec<f32>>>, terms: usize) -> Option<Vec<f32>> {
-        match &self.group {
-            None => {
-                let mut sum = PairwiseSum::default();
-                blocks.into_iter().for_each(|block| sum.push(block, add));
-                sum.total(add)
-            }
-            Some(group) => self.timed(|| exchanged(self, group, blocks, terms)),
-        }
-    }
-
     /// One line on all ranks: their number, nodes, threads, devices, and the bytes that each sends for
     /// a gradient of `floats` values. `None` for a single rank.
     ///
@@ -379,55 +352,6 @@ fn program() -> anyhow::Result<String> {
     Ok(format!("{version}, SHA-256 {}", sha256_of(&file)?))
 }
 
-fn add(mut left: Vec<f32>, right: Vec<f32>) -> Vec<f32> {
-    for (left, right) in left.iter_mut().zip(right) {
-        *left += right;
-    }
-    left
-}
-
-/// Every rank gets a slice of all blocks of all ranks, sums it, and sends its sum to all.
-fn exchanged(
-    reduce: &Reduce,
-    group: &Group,
-    blocks: Vec<Block<Vec<f32>>>,
-    terms: usize,
-) -> Option<Vec<f32>> {
-    let length = blocks.first()?.sum.len();
-    let slices: Vec<Range<usize>> = (0..reduce.count())
-        .map(|rank| reduce.share_of(rank, length))
-        .collect();
-    let own = reduce.share(length);
-    let mut sent = Vec::with_capacity(length * blocks.len());
-    for slice in &slices {
-        for block in &blocks {
-            sent.extend_from_slice(&block.sum[slice.clone()]);
-        }
-    }
-    let shapes: Vec<Vec<Block<()>>> = (0..reduce.count())
-        .map(|rank| tree::blocks_of(reduce.share_of(rank, terms)))
-        .collect();
-    let to: Vec<usize> = slices.iter().map(|s| s.len() * blocks.len()).collect();
-    let from: Vec<usize> = shapes.iter().map(|s| s.len() * own.len()).collect();
-    drop(blocks);
-    let received = group.all_to_all(&sent, &to, &from);
-    let mut sum = PairwiseSum::default();
-    let mut rest = received.as_slice();
-    for shape in shapes.into_iter().flatten() {
-        let (values, after) = rest.split_at(own.len());
-        rest = after;
-        let block = Block {
-            first: shape.first,
-            terms: shape.terms,
-            sum: values.to_vec(),
-        };
-        sum.push(block, add);
-    }
-    let total = sum.total(add)?;
-    let counts: Vec<usize> = slices.iter().map(Range::len).collect();
-    Some(group.gather_floats(&total, &counts))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -440,13 +364,6 @@ mod tests {
             (0, 1, 0..7)
         );
         assert_eq!(reduce.gather(Ok(3)).expect("its own"), [3]);
-        let block = |first: usize, value: f32| Block {
-            first,
-            terms: 1,
-            sum: vec![value],
-        };
-        let blocks = vec![block(0, 1.0), block(1, 2.0), block(2, 4.0)];
-        assert_eq!(reduce.sum_blocks(blocks, 3), Some(vec![7.0]));
         let error = reduce.agree::<()>(Err(UsageError("no".into()).into()));
         assert!(error.expect_err("its own").is::<UsageError>());
         let doubled = reduce.deal(&[1, 2, 3], |index, item| Ok(index + 2 * item));

@@ -1,6 +1,6 @@
 //! A build without MPI: there is no group of ranks.
 
-use super::NodeShare;
+use super::placement::{ALONE, NodeShare};
 
 /// A group of ranks. None exists in this build.
 pub(super) enum Group {}
@@ -29,7 +29,7 @@ impl Launch {
 
     /// This rank among those of its node.
     pub fn on_node(&self) -> NodeShare {
-        super::ALONE
+        ALONE
     }
 }
 

@@ -1,8 +1,20 @@
-//! The line at the start that says where the ranks run.
+//! Where the ranks run: their nodes, and the line at the start that says so.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
+
+/// A process among those of its node.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct NodeShare {
+    /// From 0.
+    pub index: usize,
+    /// At least 1.
+    pub count: usize,
+}
+
+/// A process without others on its node.
+pub(super) const ALONE: NodeShare = NodeShare { index: 0, count: 1 };
 
 /// Where a rank runs.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

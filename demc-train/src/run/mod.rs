@@ -10,6 +10,7 @@ pub mod run_dir;
 pub mod run_record;
 pub mod session;
 pub mod signals;
+mod starting_point;
 pub mod training;
 pub mod validation;
 pub mod warnings;

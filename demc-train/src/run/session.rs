@@ -39,9 +39,9 @@ pub struct Session {
     place: SessionPlace,
 }
 
-/// A finished run.
+/// What a complete run leaves behind besides its files.
 #[derive(Clone, Debug)]
-pub struct FinishedRun {
+pub struct RunResult {
     /// One sentence on which weights the run keeps, and why.
     pub kept: String,
     /// The scores of the kept weights, if there is a test split.
@@ -177,7 +177,7 @@ impl Session {
     ///
     /// # Errors
     /// Those of [`TrainingRun::train`] and [`TrainingRun::test`].
-    pub fn finish(self) -> anyhow::Result<Outcome<FinishedRun>> {
+    pub fn finish(self) -> anyhow::Result<Outcome<RunResult>> {
         let signals = Signals::listen()?;
         self.finish_observed(move |_| signals.received())
     }
@@ -190,11 +190,11 @@ impl Session {
     pub fn finish_observed(
         mut self,
         observer: impl FnMut(&TakenStep) -> Option<i32>,
-    ) -> anyhow::Result<Outcome<FinishedRun>> {
+    ) -> anyhow::Result<Outcome<RunResult>> {
         if let Some(stopped) = self.run.train(&self.place.device_name, observer)? {
             return Ok(Outcome::Stopped(stopped));
         }
-        Ok(Outcome::Complete(FinishedRun {
+        Ok(Outcome::Complete(RunResult {
             scores: self.run.test(&self.place.device)?,
             kept: self.run.kept_weights(),
         }))

@@ -2,7 +2,6 @@
 
 pub mod scores;
 
-use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{bail, ensure};
@@ -20,15 +19,16 @@ use crate::run::checkpoint::store::CheckpointStore;
 use crate::run::checkpoint::{self, Checkpoint, LoopState, MetricSums, SessionClock};
 use crate::run::data::{RunData, share_loader};
 use crate::run::estimate::DurationEstimate;
-use crate::run::initial::{InitialNetwork, InitialWeights, initial_network};
+use crate::run::initial::InitialWeights;
 use crate::run::observer::TakenStep;
 use crate::run::place::SessionPlace;
 use crate::run::run_dir::RunDir;
 use crate::run::run_record::RunFacts;
 use crate::run::signals::Stopped;
+use crate::run::starting_point::StartingPoint;
 use crate::run::validation::Validation;
 use crate::run::warnings::LoopFacts;
-use crate::step::optimizer::{DormantChannels, Optimizer};
+use crate::step::optimizer::DormantChannels;
 use crate::step::trainer::{StepReport, Trainer};
 
 /// Consecutive skipped steps after which a run fails despite `train.on_nan = "skip"`; ours.
@@ -51,75 +51,6 @@ pub struct TrainingRun {
     reduce: Reduce,
 }
 
-/// What a session starts from: a new run, or a checkpoint.
-struct StartingPoint {
-    model: Denoiser,
-    albedo_filter: Option<Box<Bundle>>,
-    average: Option<Denoiser>,
-    optimizer: Optimizer,
-    state: LoopState,
-    initial: Option<InitialWeights>,
-}
-
-impl StartingPoint {
-    /// Step 0. The ranges of the initial weights' scenes are added to those of `data`.
-    fn of_new_run(config: &Config, data: &mut RunData, device: &Device) -> anyhow::Result<Self> {
-        let InitialNetwork {
-            model,
-            albedo_filter,
-            weights,
-        } = initial_network(config, data.normalizer.flat_color, device)?;
-        let before = weights.as_ref().and_then(|weights| weights.ranges.as_ref());
-        if let Some(before) = before {
-            data.ranges = data.ranges.with(before);
-        }
-        Ok(StartingPoint {
-            model,
-            albedo_filter,
-            average: None,
-            optimizer: Optimizer::new(config),
-            state: LoopState::start(),
-            initial: weights,
-        })
-    }
-
-    /// The step of `checkpoint`, which has the ranges of `data`, too. `run` names the run in errors.
-    fn of_checkpoint(
-        checkpoint: Checkpoint,
-        config: &Config,
-        data: &mut RunData,
-        run: &Path,
-    ) -> anyhow::Result<Self> {
-        let Checkpoint {
-            bundle,
-            average,
-            optimizer,
-            state,
-        } = checkpoint;
-        if let Some(ranges) = &bundle.meta.ranges {
-            data.ranges = ranges.clone();
-        }
-        ensure!(
-            bundle.meta == data.meta(config.model, state.step),
-            "{}: network, layout or statistics of the checkpoint differ from this run's",
-            run.display()
-        );
-        ensure!(
-            average.is_some() == config.train.ema_decay.is_some(),
-            "{}: either the checkpoint or train.ema_decay has no weight average",
-            run.display()
-        );
-        Ok(StartingPoint {
-            model: bundle.model,
-            albedo_filter: bundle.albedo_filter,
-            average,
-            optimizer,
-            state,
-            initial: None,
-        })
-    }
-}
-
 impl TrainingRun {
     /// A new run, or the run of `checkpoint` at its step, which the processes of `reduce` train
     /// together. `device` has no autodiff.
@@ -128,12 +59,11 @@ impl TrainingRun {
     /// Scenes smaller than a patch; a checkpoint of another run; a `train.init` of another network.
     pub fn new(
         config: Config,
-        data: RunData,
+        mut data: RunData,
         dir: RunDir,
         checkpoint: Option<Checkpoint>,
         place: &SessionPlace,
     ) -> anyhow::Result<Self> {
-        let mut data = data;
         let device = place.device.clone().autodiff();
         let reduce = place.reduce.clone();
         let StartingPoint {
