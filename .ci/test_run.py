@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""Tests of .ci/run on a small repository with sections of its own."""
+"""Tests of .ci/run on a small repository with sections of its own, and of .ci/circles.py on small crates."""
 
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 import unittest
 from pathlib import Path
@@ -156,6 +157,49 @@ class Checks(unittest.TestCase):
         self.table(library="false")
         self.run_checks("all")
         self.assertEqual(record.read_text().strip(), head)
+
+
+class Circles(unittest.TestCase):
+    def check(self, files):
+        """Exit code and output of .ci/circles.py for a crate of `files`."""
+        with tempfile.TemporaryDirectory() as root:
+            for path, text in files.items():
+                file = Path(root, "one/src", path)
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_text(text)
+            subprocess.run(["git", "init", "-q", root], check=True)
+            run = subprocess.run([sys.executable, HERE / "circles.py"], cwd=root, capture_output=True, text=True)
+            return run.returncode, run.stdout + run.stderr
+
+    def test_files_that_import_each_other_are_found(self):
+        code, output = self.check({
+            "lib.rs": "mod a; mod b; pub use b::B;",
+            "a.rs": "use crate::{B};\npub struct A;",
+            "b.rs": "pub struct B;\nfn f() { super::a::A; }",
+        })
+        self.assertEqual(code, 1, output)
+        self.assertIn("a circle of a, b", output)
+
+    def test_folders_that_import_each_other_are_found(self):
+        code, output = self.check({
+            "lib.rs": "mod a; mod b;",
+            "a/mod.rs": "pub mod x; pub mod y;",
+            "a/x.rs": "use crate::b::z::Z;",
+            "a/y.rs": "pub struct Y;",
+            "b/mod.rs": "pub mod w; pub mod z;",
+            "b/w.rs": "use crate::a::{self, y::Y as Why};",
+            "b/z.rs": "pub struct Z;",
+        })
+        self.assertEqual(code, 1, output)
+        self.assertIn("a circle of a, b", output)
+
+    def test_tests_comments_and_reexports_are_no_imports(self):
+        code, output = self.check({
+            "lib.rs": "mod a; mod b; pub use a::A;",
+            "a.rs": "use crate::b::B;\npub struct A;",
+            "b.rs": "// use crate::A;\npub struct B;\n#[cfg(test)]\nmod tests { use crate::A; }",
+        })
+        self.assertEqual(code, 0, output)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@
 //! relative to the current directory. The resolved configuration, saved with the run, holds
 //! absolute paths.
 
+mod learning_rate;
 mod optimizer;
 mod problems;
 mod run;
@@ -25,7 +26,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 use toml::Value;
 
-use crate::step::schedule::LearningRate;
+pub use learning_rate::LearningRate;
 pub use optimizer::{OptimizerConfig, OptimizerKind};
 pub use run::RunConfig;
 pub(crate) use source::one_line;

@@ -4,8 +4,8 @@ use std::ops::RangeInclusive;
 
 use serde::{Deserialize, Serialize};
 
+use super::learning_rate::LrDecay;
 use super::problems::{MAX_STEPS, TableProblems};
-use crate::step::schedule::LrDecay;
 
 /// First learning rate (Sec. 4.2).
 const LR_START: f64 = 1e-4;

@@ -11,6 +11,9 @@ use demc_program::message::short_list;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+/// The log in a run directory.
+pub const METRICS: &str = "metrics.jsonl";
+
 /// `metrics.jsonl`, open to append.
 #[derive(Debug)]
 pub struct MetricsLog {

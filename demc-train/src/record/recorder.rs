@@ -1,17 +1,16 @@
 //! Writes the metrics of a run to `metrics.jsonl`, TensorBoard and the terminal.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use anyhow::Context;
 use demc_infer::picture::Picture;
 use demc_program::message::printable;
 
 use crate::config::Config;
-use crate::record::metrics_log::{MetricsLine, MetricsLog, damaged_lines};
+use crate::record::metrics_log::{METRICS, MetricsLine, MetricsLog, damaged_lines};
 use crate::record::progress::StepProgress;
 use crate::record::tensorboard::EventFile;
-use crate::run::run_dir::RunDir;
-use crate::run::validation::write_strip;
 
 /// Directory of the TensorBoard events in a run directory.
 const TENSORBOARD: &str = "tensorboard";
@@ -34,13 +33,13 @@ struct Records {
 }
 
 impl Recorder {
-    /// Opens the records of `dir` for the steps after `step`.
+    /// Opens the records in the run directory `run` for the steps after `step`.
     ///
     /// # Errors
     /// A file that cannot be read or written.
-    pub fn open(dir: &RunDir, config: &Config, step: u64, patches: usize) -> anyhow::Result<Self> {
-        let metrics = dir.metrics(step)?;
-        let mut events = EventFile::open(&dir.path().join(TENSORBOARD), step)?;
+    pub fn open(run: &Path, config: &Config, step: u64, patches: usize) -> anyhow::Result<Self> {
+        let metrics = MetricsLog::open(&run.join(METRICS), step)?;
+        let mut events = EventFile::open(&run.join(TENSORBOARD), step)?;
         if step == 0 {
             let text = format!("```toml\n{}```", config.to_toml());
             events.text(0, "config", &text)?;
@@ -62,7 +61,7 @@ impl Recorder {
         }
         let per_step = config.patches_per_step();
         Ok(Recorder(Some(Records {
-            run: dir.path().into(),
+            run: run.into(),
             metrics,
             events,
             progress,
@@ -176,6 +175,16 @@ impl Pace {
             0.0
         }
     }
+}
+
+/// Writes a picture into the run directory.
+///
+/// # Errors
+/// A file that cannot be written.
+pub fn write_strip(run: &Path, name: &str, picture: &Picture) -> anyhow::Result<()> {
+    let dir = run.join("strips");
+    std::fs::create_dir_all(&dir).with_context(|| dir.display().to_string())?;
+    Ok(picture.write_png(&dir.join(name))?)
 }
 
 /// The result of `work` and its duration.

@@ -16,27 +16,18 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
-use demc_data::ChannelLayout;
 use demc_infer::bundle::locate::{BEST, LATEST};
 use demc_program::file::{remove_abandoned, write_whole};
 
 use crate::config::Config;
-use crate::record::metrics_log::MetricsLog;
+use crate::record::metrics_log::METRICS;
 use crate::run::checkpoint::store::CheckpointStore;
 use crate::run::data::RunData;
+use crate::run::own_files::{CONFIG, LAYOUT, OWN_FILES, RUN, is_usable};
 use crate::run::run_record::{RunFacts, RunRecord};
 
-/// The resolved configuration.
-pub const CONFIG: &str = "config.toml";
-/// The record of versions, device and data.
-const RUN: &str = "run.json";
-const METRICS: &str = "metrics.jsonl";
-/// The channel layout, if it is not a preset.
-const LAYOUT: &str = "layout.toml";
 /// Locked by the training process.
 const LOCK: &str = "lock";
-/// Files that describe the run, copied into its checkpoints.
-pub const OWN_FILES: [&str; 3] = [CONFIG, RUN, LAYOUT];
 /// Scores of the test split.
 pub const SCORES: &str = "test.json";
 /// Files that show that a directory contains a run.
@@ -205,14 +196,6 @@ impl RunDir {
         Ok(())
     }
 
-    /// The log, without the lines after `step`, which a resumed run repeats.
-    ///
-    /// # Errors
-    /// A log that cannot be read or written.
-    pub fn metrics(&self, step: u64) -> anyhow::Result<MetricsLog> {
-        MetricsLog::open(&self.path.join(METRICS), step)
-    }
-
     /// Writes a file of the run, complete or not at all.
     ///
     /// # Errors
@@ -221,19 +204,6 @@ impl RunDir {
         Ok(write_whole(&self.path.join(name), |file| {
             file.write_all(bytes)
         })?)
-    }
-}
-
-/// Whether the bytes of one of [`OWN_FILES`] in a run directory can be used. The record of a run
-/// never changes, so that of a checkpoint is preferred.
-pub fn is_usable(name: &str, bytes: &[u8]) -> bool {
-    let Ok(text) = str::from_utf8(bytes) else {
-        return false;
-    };
-    match name {
-        CONFIG => Config::parse(Path::new(CONFIG), text, &[]).is_ok(),
-        LAYOUT => toml::from_str::<ChannelLayout>(text).is_ok(),
-        _ => false,
     }
 }
 

@@ -221,7 +221,12 @@ impl TrainingRun {
             initial: self.initial.as_ref(),
         };
         let notes = self.dir.open(&self.config, &self.data, facts)?;
-        let recorder = Recorder::open(&self.dir, &self.config, self.state.step, self.patches())?;
+        let recorder = Recorder::open(
+            self.dir.path(),
+            &self.config,
+            self.state.step,
+            self.patches(),
+        )?;
         for note in notes {
             recorder.say(&format!("note: {note}"));
         }

@@ -1,9 +1,6 @@
 //! Scores and pictures of whole scenes, for validation and for the test split. It denoises with the
 //! code of `demc-infer`, as users do.
 
-use std::path::Path;
-
-use anyhow::Context;
 use demc_data::{Scene, read_frame};
 use demc_infer::Bundle;
 use demc_infer::evaluate::{ImageScore, Report};
@@ -120,14 +117,4 @@ fn whole(mut scenes: Vec<SceneResult>) -> Validation {
         report: Report::new(scenes.into_iter().map(|scene| scene.score).collect()),
         health,
     }
-}
-
-/// Writes a picture into the run directory.
-///
-/// # Errors
-/// A file that cannot be written.
-pub fn write_strip(run: &Path, name: &str, picture: &Picture) -> anyhow::Result<()> {
-    let dir = run.join("strips");
-    std::fs::create_dir_all(&dir).with_context(|| dir.display().to_string())?;
-    Ok(picture.write_png(&dir.join(name))?)
 }

@@ -4,5 +4,4 @@ pub mod ema;
 pub mod gradients;
 pub mod optimizer;
 mod running_statistics;
-pub mod schedule;
 pub mod trainer;

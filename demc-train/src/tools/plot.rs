@@ -9,10 +9,8 @@ use serde::Deserialize;
 
 use demc_program::exit::UsageError;
 
-use crate::record::metrics_log::{StoredLines, damaged_lines, read_lines};
+use crate::record::metrics_log::{METRICS, StoredLines, damaged_lines, read_lines};
 use crate::tools::chart::figure::{AxisScale, Figure, LinePanel, Series};
-
-const METRICS: &str = "metrics.jsonl";
 
 /// Options of the curves.
 #[derive(Clone, Copy, Debug, PartialEq)]

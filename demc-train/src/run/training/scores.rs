@@ -7,7 +7,7 @@ use demc_infer::bundle::{Bundle, Names, Precision};
 use demc_infer::evaluate::Report;
 
 use super::TrainingRun;
-use crate::record::recorder::Recorder;
+use crate::record::recorder::{Recorder, write_strip};
 use crate::run::checkpoint::BestValidation;
 use crate::run::run_dir::SCORES;
 use crate::run::validation::{self, Validation};
@@ -67,7 +67,7 @@ impl TrainingRun {
             .context("test")?;
         if self.reduce.is_first() {
             if let Some(picture) = picture {
-                validation::write_strip(self.dir.path(), "test.png", &picture)?;
+                write_strip(self.dir.path(), "test.png", &picture)?;
             }
             self.dir
                 .write(SCORES, &serde_json::to_vec_pretty(&report)?)?;

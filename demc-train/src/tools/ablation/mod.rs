@@ -189,7 +189,7 @@ fn finished(config: &Config) -> anyhow::Result<Option<FinishedRun>> {
     );
     let text = fs::read_to_string(&scores).with_context(|| scores.display().to_string())?;
     let report = serde_json::from_str(&text).with_context(|| scores.display().to_string())?;
-    let seconds = metrics_log::elapsed(&dir.join("metrics.jsonl")).unwrap_or(f64::NAN);
+    let seconds = metrics_log::elapsed(&dir.join(metrics_log::METRICS)).unwrap_or(f64::NAN);
     Ok(Some(FinishedRun { report, seconds }))
 }
 
