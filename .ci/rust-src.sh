@@ -1,6 +1,6 @@
 #!/bin/sh
 # Puts the source of the standard library into the toolchain, from Debian's package rust-src of the same
-# version, for machines on which rustup reaches no server. release/build.sh uses it.
+# version, for machines on which rustup reaches no server. tools/release/build.sh uses it.
 set -eu
 version=$(rustc --version | cut -d' ' -f2)
 source=$(rustc --print sysroot)/lib/rustlib/src/rust

@@ -33,9 +33,9 @@ pack() {
     built=$(cargo test --release -p demc-tests --features "$features" --test suite --no-run --message-format=json |
         grep -o '"executable":"[^"]*/suite-[^"]*"' | tail -1 | cut -d'"' -f4)
     [ -x "$built" ] || fail "the parity test was not built"
-    mkdir -p "$to"/{benches/results,python,target/release,tests/parity}
+    mkdir -p "$to"/{benches/results,bindings/python,target/release,tests/parity}
     cp -r benches/gpu.sh benches/peers "$to/benches/"
-    cp -r python/demc "$to/python/"
+    cp -r bindings/python/demc "$to/bindings/python/"
     cp -r tests/parity/fixtures "$to/tests/parity/"
     cp "${CARGO_TARGET_DIR:-target}/release/peer" "$to/target/release/peer"
     cp "$built" "$to/target/release/parity"

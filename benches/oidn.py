@@ -73,7 +73,7 @@ def model_seconds(name: str) -> float:
 
 def guided_seconds(quality: str) -> float:
     """OIDN with albedo and normal denoised first, for which it has networks of its own."""
-    return seconds_of(GUIDES, ROOT / "python/tools", quality) + oidn_seconds(quality, "hdr_calb_cnrm")
+    return seconds_of(GUIDES, ROOT / "tools", quality) + oidn_seconds(quality, "hdr_calb_cnrm")
 
 
 def oidn_seconds(quality: str, images: str = "hdr_alb_nrm") -> float:

@@ -51,7 +51,7 @@ def scores_of(data: pathlib.Path, model: tuple[str, pathlib.Path], work: pathlib
     for peer in PEERS:
         images = work / peer
         if not (images / "complete").exists():
-            run(sys.executable, ROOT / "python/tools/baselines.py", peer, "--data", data, "-o", images)
+            run(sys.executable, ROOT / "tools/baselines.py", peer, "--data", data, "-o", images)
             (images / "complete").touch()
         baselines += ["--baseline", f"{peer}={images}"]
     report = work / f"{name}.json"

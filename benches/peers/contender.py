@@ -21,7 +21,7 @@ import time
 from pathlib import Path
 from typing import Callable
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "python"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "bindings" / "python"))
 
 NAMES = ("color_gamma", "features_z")
 CHECK_STEPS = 3  # the third loss depends on two updates of the weights
@@ -30,7 +30,7 @@ QUICK_WARM_SECONDS = 0.05
 
 
 class TorchTraining:
-    """Forward, loss, backward and Adam of the PyTorch implementation in python/."""
+    """Forward, loss, backward and Adam of the PyTorch implementation in bindings/python/."""
 
     ADAMS = {"fused": {"fused": True}, "foreach": {"foreach": True}}
 

@@ -44,7 +44,7 @@ render_albedo() {
     for views in "cycles 101-140" "mitsuba 202-224" "luxcore 302-323"; do
         "$python" tests/renderers/data_set.py $views -o data/bundled/stock --size 192x192 --ref-spp 96
     done
-    "$python" python/render -o data/bundled/rooms --rooms 26 --stills 26 --size 192 --grain 0.8 --sun 0.8 \
+    "$python" tools/render -o data/bundled/rooms --rooms 26 --stills 26 --size 192 --grain 0.8 --sun 0.8 \
         --ref-spp 64 --residual 1 --seed 71
     "$python" configs/bundled/albedo_set.py data/bundled/stock data/bundled/rooms -o data/bundled/albedo
 }
@@ -54,9 +54,9 @@ render_train() {
         echo "error: $base/manifest.json: no such file; --base names another data set" >&2
         exit 1
     }
-    "$python" python/render -o data/bundled/train --preset train --with "$base"
-    "$python" python/tools/references.py --data data/bundled/train -o data/bundled/clean
-    "$python" python/tools/references.py --data data/bundled/train -o data/bundled/filtered --albedo-filter $filter
+    "$python" tools/render -o data/bundled/train --preset train --with "$base"
+    "$python" tools/references.py --data data/bundled/train -o data/bundled/clean
+    "$python" tools/references.py --data data/bundled/train -o data/bundled/filtered --albedo-filter $filter
 }
 
 # Trains one stage: train NAME

@@ -1,4 +1,4 @@
-"""Makes the parity fixtures with the PyTorch package (`pip install './python[torch]'`): `python tests/parity/make_fixtures.py`.
+"""Makes the parity fixtures with the PyTorch package (`pip install './bindings/python[torch]'`): `python tests/parity/make_fixtures.py`.
 
 Everything is computed in float64 and stored as float32. So a fixture is exact to the last bit of a float32, does not
 depend on the machine, and tests measure the error of the Rust side. Tensors have PyTorch's names.

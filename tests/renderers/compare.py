@@ -23,7 +23,7 @@ import numpy as np
 from data_set import NAMES, buffers, channels
 
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parent.parent / "python" / "tools"))
+sys.path.insert(0, str(HERE.parent.parent / "tools"))
 RENDERERS = {"cycles": "Blender Cycles", "mitsuba": "Mitsuba", "luxcore": "LuxCore"}
 METHODS = {"noisy": "noisy", "demc": "demc", "oidn": "OIDN", "prefiltered": "OIDN, both denoised first"}
 REFERENCE_SEED = 9

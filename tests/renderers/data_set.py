@@ -3,7 +3,7 @@
     python data_set.py cycles 101-160 -o data/stock --ref-spp 128 [--size 224x224]
 
 Each view becomes one file of the layout `demc-exr`: colour and features of 4 samples per pixel, and a reference with
-other samples, whose own albedo and normal are kept for `python/tools/references.py`. The second albedo is a copy of the
+other samples, whose own albedo and normal are kept for `tools/references.py`. The second albedo is a copy of the
 first. Existing files are kept, so an interrupted command can be repeated. `docs/renderers.md` reports scenes 1 to 4; this
 script refuses them. `--with` also lists the training scenes of another data set. `--copies` lists each view several times,
 so that a few views count more.

@@ -1,4 +1,4 @@
-"""Tests of the Blender extension in `integrations/blender`, without a window (`pip install bpy numpy OpenEXR`).
+"""Tests of the Blender extension in `bindings/blender`, without a window (`pip install bpy numpy OpenEXR`).
 
     DEMC_INFER=target/release/demc-infer python -m unittest tests/renderers/test_blender.py
 
@@ -47,7 +47,7 @@ class Extension(unittest.TestCase):
         cls.scene = with_cycles.build(scenes.scene(15))
         archive = files("demc_denoiser.zip")
         with zipfile.ZipFile(archive, "w") as package:
-            for file in (ROOT / "integrations" / "blender").iterdir():
+            for file in (ROOT / "bindings" / "blender").iterdir():
                 if file.is_file():
                     package.write(file, file.name)
         bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)

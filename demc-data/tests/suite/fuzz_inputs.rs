@@ -1,4 +1,4 @@
-//! The inputs in `fuzz/`: seeds are files of every kind; findings are files that once caused a
+//! The inputs in `tests/fuzz/`: seeds are files of every kind; findings are files that once caused a
 //! failure.
 
 use std::fs;
@@ -23,9 +23,9 @@ fn inputs(target: &str) -> Vec<PathBuf> {
 /// The seeds of the EXR targets, the smallest files of each kind. To write them again, run `cargo
 /// test --release -p demc-data --test suite fuzz_inputs -- --ignored`.
 #[test]
-#[ignore = "writes into fuzz/seeds"]
+#[ignore = "writes into tests/fuzz/seeds"]
 fn write_seeds() {
-    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/seeds/exr");
+    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/fuzz/seeds/exr");
     fs::create_dir_all(&dir).expect("writable");
     let small = |name: Option<&str>, method| header(name, (6, 5), scene_kinds(), method);
     use exr::prelude::Compression as Method;

@@ -71,7 +71,7 @@ pub struct Arguments {
 
 #[derive(Clone, Copy, PartialEq, ValueEnum)]
 enum Format {
-    /// Weights for demc-infer, or for PyTorch with the package of python/
+    /// Weights for demc-infer, or for PyTorch with the package of bindings/python/
     Safetensors,
     /// A graph for ONNX Runtime, TensorRT, OpenVINO and others
     Onnx,

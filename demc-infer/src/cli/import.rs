@@ -11,7 +11,7 @@ use super::outputs::check_output;
 use crate::bundle::locate;
 use crate::{BundleError, BundleFile, Names, Precision};
 
-/// Import weights that were trained in PyTorch with the package of python/.
+/// Import weights that were trained in PyTorch with the package of bindings/python/.
 ///
 /// Only the tensors come from the file. Network, statistics, channel layout and step come from the
 /// model that training started from (--like), or from the file's own header. The file must have

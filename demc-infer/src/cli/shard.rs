@@ -2,7 +2,7 @@
 
 use std::str::FromStr;
 
-/// Part I of N, from 1/N to N/N. `python/demc/torch/shard.py` deals out in the same way.
+/// Part I of N, from 1/N to N/N. `bindings/python/demc/torch/shard.py` deals out in the same way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
     /// From 1 to `count`.

@@ -42,7 +42,7 @@ const OBJECT: usize = 11;
 pub enum Runtime {
     /// ONNX Runtime, for an ONNX file.
     OnnxRuntime,
-    /// PyTorch with the package of `python/`, for a bundle.
+    /// PyTorch with the package of `bindings/python/`, for a bundle.
     PyTorch,
 }
 
@@ -52,7 +52,7 @@ impl Runtime {
     fn name_and_packages(self) -> [&'static str; 2] {
         match self {
             Runtime::OnnxRuntime => ["onnx", "numpy onnxruntime"],
-            Runtime::PyTorch => ["torch", "'./python[torch]'"],
+            Runtime::PyTorch => ["torch", "'./bindings/python[torch]'"],
         }
     }
 }

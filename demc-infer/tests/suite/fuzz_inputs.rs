@@ -1,4 +1,4 @@
-//! Tests with the inputs of `fuzz/` for bundles: valid seeds, and findings that once caused a
+//! Tests with the inputs of `tests/fuzz/` for bundles: valid seeds, and findings that once caused a
 //! failure.
 
 use std::collections::HashMap;
@@ -26,7 +26,7 @@ fn inputs(name: &str) -> Vec<(PathBuf, Vec<u8>)> {
 /// Writes the header and the smallest tensors of a bundled model:
 /// `cargo test --release -p demc-infer --test suite fuzz_inputs -- --ignored`.
 #[test]
-#[ignore = "writes into fuzz/seeds"]
+#[ignore = "writes into tests/fuzz/seeds"]
 fn write_seeds() {
     let model = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/quality.safetensors");
     let bytes = fs::read(model).expect("it is in the repository");

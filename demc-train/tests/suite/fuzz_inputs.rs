@@ -1,4 +1,4 @@
-//! The inputs of `fuzz/`: findings in configurations, each of which caused a failure, and valid logs.
+//! The inputs of `tests/fuzz/`: findings in configurations, each of which caused a failure, and valid logs.
 
 use std::fs;
 use std::path::Path;
@@ -9,7 +9,7 @@ use serde_json::Value;
 
 #[test]
 fn every_finding_is_valid_or_gives_a_one_line_error() {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/findings/config");
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/fuzz/findings/config");
     for file in fs::read_dir(folder).expect("it is in the repository") {
         let path = file.expect("readable").path();
         let bytes = fs::read(&path).expect("readable");
@@ -32,7 +32,7 @@ fn every_finding_is_valid_or_gives_a_one_line_error() {
 
 #[test]
 fn every_line_of_a_seed_of_a_log_is_intact() {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/seeds/metrics");
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/fuzz/seeds/metrics");
     for file in fs::read_dir(folder).expect("it is in the repository") {
         let path = file.expect("readable").path();
         let bytes = fs::read(&path).expect("readable");

@@ -1,7 +1,7 @@
-//! Parity with an installed PyTorch: random weights are exported, loaded by `python/` with
+//! Parity with an installed PyTorch: random weights are exported, loaded by `bindings/python/` with
 //! `strict=True`, and run.
 //!
-//! Needs a Python with the package of `python/` (`pip install './python[torch]'`), named by `DEMC_PYTHON`
+//! Needs a Python with the package of `bindings/python/` (`pip install './bindings/python[torch]'`), named by `DEMC_PYTHON`
 //! (default `python3`). Without it, the test reports that it is skipped; with
 //! `DEMC_REQUIRE_TORCH=1` it fails.
 
@@ -30,8 +30,11 @@ const OUTPUT: Tolerance = Tolerance {
 
 #[test]
 fn pytorch_loads_every_export_strictly_and_agrees() {
-    let Some(python) = Python::with("torch, demc", "'./python[torch]'", "DEMC_REQUIRE_TORCH")
-    else {
+    let Some(python) = Python::with(
+        "torch, demc",
+        "'./bindings/python[torch]'",
+        "DEMC_REQUIRE_TORCH",
+    ) else {
         return;
     };
     for variant in Variant::ALL {

@@ -1,7 +1,7 @@
 //! Use of exported files in Python: `export --verify`, weights trained in PyTorch and imported
-//! again, and the programs in `python/examples`.
+//! again, and the programs in `bindings/python/examples`.
 //!
-//! Needs a Python (`DEMC_PYTHON`, default `python3`) with `pip install onnxruntime './python[torch]'`. Without it, the tests report that they are skipped; with `DEMC_REQUIRE_ONNX=1` or
+//! Needs a Python (`DEMC_PYTHON`, default `python3`) with `pip install onnxruntime './bindings/python[torch]'`. Without it, the tests report that they are skipped; with `DEMC_REQUIRE_ONNX=1` or
 //! `DEMC_REQUIRE_TORCH=1` they fail.
 
 use std::ops::Range;
@@ -33,14 +33,14 @@ fn onnx() -> Option<Python> {
     let packages = "numpy, onnxruntime, OpenEXR, demc";
     Python::with(
         packages,
-        "onnxruntime './python[torch]'",
+        "onnxruntime './bindings/python[torch]'",
         "DEMC_REQUIRE_ONNX",
     )
 }
 
 fn torch() -> Option<Python> {
     let packages = "torch, demc, OpenEXR";
-    Python::with(packages, "'./python[torch]'", "DEMC_REQUIRE_TORCH")
+    Python::with(packages, "'./bindings/python[torch]'", "DEMC_REQUIRE_TORCH")
 }
 
 fn repository() -> PathBuf {
@@ -167,11 +167,11 @@ fn weights_trained_in_pytorch_are_imported() {
     }
 }
 
-/// Compares `script` of `python/examples` on the file `model` with this program, on a sample image.
+/// Compares `script` of `bindings/python/examples` on the file `model` with this program, on a sample image.
 fn example(python: &Python, script: &str, model: &Path, bundle: &Bundle) {
     let source = repository().join("data/sample/test/gen-table-test-1.exr");
     let target = model.with_file_name("out.exr");
-    let script = repository().join("python/examples").join(script);
+    let script = repository().join("bindings/python/examples").join(script);
     python.succeed(&[&script, model, &source, &target]);
     let frame = demc_data::read_frame(&source, &bundle.meta.layout).expect("a frame");
     let expected = bundle.denoise(&frame).expect("denoised");

@@ -1,0 +1,244 @@
+"""Renders training data with all twelve feature channels, using Mitsuba 3.
+
+    pip install mitsuba numpy OpenEXR
+    python tools/render -o data/rooms --rooms 60                     furnished rooms, from a seed
+    python tools/render -o data/stills --stills 60                   still lifes, from a seed
+    python tools/render -o data/mine kitchen.xml hall.xml            own scenes; a sensor is a view
+    python tools/render -o data/rooms --rooms 60 --with data/sample  lists other scenes, too
+    python tools/render -o data/rooms --rooms 60 --spp 1,4,16        three noisy images per view
+    python tools/render -o data/rooms --rooms 60 --shard 1/4         a part, on a farm (docs/farms.md)
+    python tools/render -o data/bundled --preset train               the training data of the bundled models
+    python tools/render -o data/heldout --preset heldout             their test scenes
+
+Existing images are kept: rerun a command to resume it. Mitsuba needs LLVM's shared library (Debian:
+libllvm19); DRJIT_LIBLLVM_PATH names it if Mitsuba does not find it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import views
+from reserved import ReservedRoom, ReservedStill
+from rooms import Room
+from stills import Still
+from variant import mi
+
+from demc.torch.files import write_json, write_text  # `views` puts the package on the path.
+from demc.torch.shard import add_shard_flag
+
+NOISE = (0.2, 16.0)
+"""Range of RelMSE of a room's noisy image. Views outside it are left out."""
+STILL_NOISE = (0.03, 16.0)
+"""The same for a still life. Its cleaner images teach the network to keep textures."""
+LEFT_OUT = ".left-out"
+"""Ending of the file that has the reason why a view was left out."""
+NEAR, STILL_NEAR = 0.5, 0.15
+"""Smallest distance of a view, in metres, in rooms and still lifes (`Budget.near`)."""
+
+
+COUNTS = [1, 2, 4, 8, 16, 32, 64, 128, 256]
+REPEATS = {16: 2, 64: 6}
+"""How often an epoch takes the images of at least so many samples per pixel: with --counts, they are few."""
+PRESETS = {
+    "train": {"rooms": 680, "stills": 380, "size": 192, "spp": COUNTS, "counts": 3, "traits": 0.25, "seed": 29},
+    "heldout": {
+        "rooms": 78, "stills": 20, "views": 1, "size": 192, "spp": COUNTS[::2], "ref_spp": 2048, "residual": 0.0,
+        "reserved": True, "split": "test", "seed": 1029,
+    },
+}
+"""Options of `--preset`."""
+
+
+@dataclass
+class Base:
+    """A scene and its views."""
+
+    name: str
+    views: list[str]
+    seed: int
+    budget: views.Budget
+    load: Callable[[], mi.Scene]
+
+
+def main() -> None:
+    args = arguments()
+    folder = args.output / args.split
+    folder.mkdir(parents=True, exist_ok=True)
+    budget = views.Budget(args.ref_spp, args.residual)
+    known = left_out(args)
+    rooms = made(args, "room", args.rooms, furnished_room, 0, replace(budget, noise=NOISE, near=NEAR))
+    stills = made(args, "still", args.stills, still_life, 50000, replace(budget, noise=STILL_NOISE, near=STILL_NEAR))
+    bases = [*own_scenes(args, budget), *rooms, *stills]
+    own = {name for base in bases for name in base.views}
+    if args.shard:
+        own = args.shard.keep(own)
+    for base in bases:
+        wanted = {}
+        for view, name in enumerate(base.views):
+            rng = np.random.default_rng([base.seed, view, 7])
+            counts = drawn_counts(args, rng)
+            files = {count: name if args.spp == [count] else f"{name}-{count}spp" for count in counts}
+            wanted[name] = files, views.Traits.draw(rng, args.traits)
+        missing = [
+            name for name, (files, _) in wanted.items()
+            if name in own and name not in known and not all((folder / f"{file}.exr").exists() for file in files.values())
+        ]
+        scene = base.load() if missing else None
+        for name in missing:
+            start, view = time.monotonic(), base.views.index(name)
+            files, traits = wanted[name]
+            try:
+                said = []
+                images = views.photograph(scene, view, (base.seed + view) * 1000, base.budget, [*files], traits)
+                for (channels, facts), file in zip(images, files.values()):
+                    place = {"name": file, "split": args.split, "base": base.name, "file": f"{args.split}/{file}.exr"}
+                    if args.counts:
+                        place["repeat"] = max((times for least, times in REPEATS.items() if facts["spp"] >= least), default=1)
+                    views.write(folder / f"{file}.exr", channels, place | facts)
+                    said.append("RelMSE {noisy_relmse:.2f} at {spp} spp".format(**facts))
+                said = f"{', '.join(said)}, reference {facts['ref_residual_relmse']:.4f} at {facts['ref_spp']} spp"
+            except views.Unsuitable as reason:
+                write_text(folder / f"{name}{LEFT_OUT}", str(reason))
+                said = f"left out: {reason}"
+            write_manifest(args)
+            print(f"{name}: {said}, {time.monotonic() - start:.0f} s", flush=True)
+    write_manifest(args)
+
+
+def drawn_counts(args, rng: np.random.Generator) -> list[int]:
+    """The numbers of samples per pixel of a view's noisy images, in order.
+
+    One is drawn for the reference to serve, large ones less often because they cost most. The
+    others are drawn from all that this reference serves, too.
+    """
+    if not args.counts:
+        return args.spp
+    chances = np.cbrt(1 / np.array(args.spp))
+    served = int(rng.choice(args.spp, p=chances / chances.sum()))
+    limit = max(served, args.ref_spp // views.REFERENCE_SHARE)
+    others = [count for count in args.spp if count <= limit and count != served]
+    return sorted([served, *map(int, rng.choice(others, min(args.counts - 1, len(others)), replace=False))])
+
+
+def own_scenes(args, budget: views.Budget) -> Iterator[Base]:
+    """Scenes from files; each sensor is a view."""
+    for path in args.scenes:
+        scene = mi.load_file(str(path))
+        names = [f"{path.stem}-{view}" for view in range(len(scene.sensors()))]
+        yield Base(path.stem, names, args.seed * 100003, budget, lambda scene=scene: scene)
+
+
+def made(args, kind: str, count: int, make: Callable, first_seed: int, budget: views.Budget) -> Iterator[Base]:
+    """Rooms or still lifes. Each depends on its number and the seed only, not on `count`."""
+    for index in range(count):
+
+        def load(index: int = index) -> mi.Scene:
+            subject, rng = make(args, index)
+            for view in range(args.views):
+                subject.scene[f"camera{view}"] = subject.camera(rng, args.size)
+            return mi.load_dict(subject.scene)
+
+        name = f"{kind}-{args.seed}-{index}"
+        names = [f"{name}-{view}" for view in range(args.views)]
+        yield Base(name, names, args.seed * 100003 + first_seed + index * 16, budget, load)
+
+
+def furnished_room(args, index: int) -> tuple[Room, np.random.Generator]:
+    """A room, and the random generator for its cameras."""
+    rng = np.random.default_rng([args.seed, index])
+    # Separate generators: the room stays the same without grain, sun, or black.
+    kind = ReservedRoom if args.reserved else Room
+    room = kind(rng, args.grain, np.random.default_rng([args.seed, index, 2]))
+    outside = np.random.default_rng([args.seed, index, 1])
+    if outside.random() < args.sun:
+        room.sun(outside)
+    paint = np.random.default_rng([args.seed, index, 3])
+    if paint.random() < args.black:
+        room.blacken(paint)
+    return room, rng
+
+
+def still_life(args, index: int) -> tuple[Still, np.random.Generator]:
+    """A still life, and the random generator for its cameras."""
+    rng = np.random.default_rng([args.seed, index, 4])
+    kind = ReservedStill if args.reserved else Still
+    still = kind(rng, args.grain, np.random.default_rng([args.seed, index, 5]))
+    lamps = np.random.default_rng([args.seed, index, 6])
+    if lamps.random() < args.studio:
+        still.darken(lamps)
+    return still, rng
+
+
+def left_out(args) -> dict[str, str]:
+    """The reason for each view that was left out, from the manifest and from files of all workers."""
+    manifest = args.output / "manifest.json"
+    listed = json.loads(manifest.read_text()).get("left_out", {}) if manifest.exists() else {}
+    return listed | {path.stem: path.read_text() for path in sorted(args.output.glob(f"*/*{LEFT_OUT}"))}
+
+
+def write_manifest(args) -> None:
+    """Lists all rendered scenes and those of `--with`. A shard leaves that to the command without."""
+    if args.shard:
+        return
+    scenes = [views.entry_of(path) for path in sorted(args.output.glob("*/*.exr"))]
+    for other in args.beside:
+        for entry in json.loads((other / "manifest.json").read_text())["scenes"]:
+            file = os.path.relpath((other / entry["file"]).resolve(), args.output.resolve())
+            scenes.append(entry | {"file": file})
+    manifest = {"format": "demc-exr 1", "renderer": f"Mitsuba {mi.__version__}", "scenes": scenes, "left_out": left_out(args)}
+    write_json(args.output / "manifest.json", manifest)
+
+
+def numbers(text: str) -> list[int]:
+    """Rising positive numbers: `1,4,16`."""
+    found = sorted({int(part) for part in text.split(",")})
+    if found[0] < 1:
+        raise ValueError
+    return found
+
+
+def arguments() -> argparse.Namespace:
+    whole = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("python tools/render", description=__doc__, formatter_class=whole)
+    parser.add_argument("scenes", nargs="*", type=Path, metavar="SCENE.xml", help="Mitsuba scenes to render")
+    parser.add_argument("-o", "--output", required=True, type=Path, metavar="DIR", help="data set; other images in it are kept")
+    parser.add_argument("--rooms", type=int, default=0, metavar="N", help="number of rooms [0]")
+    parser.add_argument("--stills", type=int, default=0, metavar="N", help="number of still lifes [0]")
+    parser.add_argument("--views", type=int, default=2, metavar="N", help="views per room or still life [2]")
+    parser.add_argument("--size", type=int, default=224, metavar="PIXELS", help="height and width of rooms and still lifes [224]")
+    parser.add_argument("--sun", type=float, default=0.6, metavar="SHARE", help="share of the rooms with windows that the sun shines into [0.6]")
+    parser.add_argument("--grain", type=float, default=0.6, metavar="SHARE", help="share of colours and patterns that are boards, stone, or cloth [0.6]")
+    parser.add_argument("--black", type=float, default=0.2, metavar="SHARE", help="share of the rooms with black bars and blinds [0.2]")
+    parser.add_argument("--studio", type=float, default=0.15, metavar="SHARE", help="share of the still lifes in a black studio [0.15]")
+    parser.add_argument("--spp", type=numbers, default=[4], metavar="N,...", help="samples per pixel of the noisy images [4]")
+    parser.add_argument("--counts", type=int, metavar="N", help="largest number of noisy images per view, drawn from --spp [all]")
+    parser.add_argument("--traits", type=float, default=0.0, metavar="SHARE", help="share of the views with a Gaussian pixel filter, with albedo behind glass, and with another exposure, each [0]")
+    parser.add_argument("--ref-spp", type=int, default=128, metavar="N", help="largest number of samples per pixel of the reference [128]")
+    parser.add_argument("--residual", type=float, default=0.03, metavar="X", help="expected RelMSE at which a reference is good enough [0.03]")
+    parser.add_argument("--reserved", action="store_true", help="furniture, textures, and lights that rooms and still lifes do not have otherwise")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of rooms, still lifes, and samples [1]")
+    parser.add_argument("--split", choices=("train", "test"), default="train", help="split of the rendered views [train]")
+    parser.add_argument("--with", dest="beside", action="append", default=[], type=Path, metavar="DIR", help="data set whose scenes are also listed; can be repeated")
+    parser.add_argument("--preset", choices=[*PRESETS], help="training data or test scenes of the bundled models; other options change it")
+    add_shard_flag(parser, "views")
+    if preset := parser.parse_known_args()[0].preset:
+        parser.set_defaults(**PRESETS[preset])
+    args = parser.parse_args()
+    if not args.scenes and args.rooms < 1 and args.stills < 1:
+        parser.error("nothing to render: --rooms N, --stills N, or SCENE.xml")
+    stems = [path.stem for path in args.scenes]
+    if len(set(stems)) < len(stems):
+        parser.error("two scene files have the same name")
+    return args
+
+
+if __name__ == "__main__":
+    main()
