@@ -21,8 +21,8 @@ for kind in shared static; do
         # The linker prefers a shared library, so the archive is named.
         static) read -ra libraries <<<"$(pkg-config --cflags --libs --static demc | sed "s|-ldemc|$prefix/lib/libdemc.a|") -lm" ;;
     esac
-    "${CC:-cc}" -std=c99 "${flags[@]}" "$root/demc-c/examples/denoise.c" -o "c-$kind" "${libraries[@]}"
-    "${CXX:-c++}" -std=c++11 "${flags[@]}" "$root/demc-c/examples/denoise.cpp" -o "cpp-$kind" "${libraries[@]}"
+    "${CC:-cc}" -std=c99 "${flags[@]}" "$root/bindings/c/examples/denoise.c" -o "c-$kind" "${libraries[@]}"
+    "${CXX:-c++}" -std=c++11 "${flags[@]}" "$root/bindings/c/examples/denoise.cpp" -o "cpp-$kind" "${libraries[@]}"
     "${CC:-cc}" -std=c99 "${flags[@]}" "$root"/tests/c/{misuse,use}.c -o "misuse-$kind" "${libraries[@]}"
 done
 if ldd ./misuse-static | grep demc; then echo "error: the static program needs the shared library"; exit 1; fi

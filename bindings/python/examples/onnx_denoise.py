@@ -1,6 +1,6 @@
 """Denoises an EXR file of any renderer with an ONNX file of `demc-infer export`.
 
-pip install onnxruntime OpenEXR ./python (in the repository root). PyTorch is not used.
+pip install onnxruntime OpenEXR ./bindings/python (in the repository root). PyTorch is not used.
 """
 
 import argparse

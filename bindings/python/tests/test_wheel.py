@@ -1,6 +1,6 @@
 """Tests of the newest wheel in dist/ in a new virtual environment, with a `PATH` without Rust.
 
-`pip wheel --no-deps ./python --wheel-dir dist` makes the wheel. Without it the tests are skipped, unless
+`pip wheel --no-deps ./bindings/python --wheel-dir dist` makes the wheel. Without it the tests are skipped, unless
 DEMC_REQUIRE_WHEEL=1.
 """
 

@@ -47,7 +47,7 @@ pub enum Runtime {
 }
 
 impl Runtime {
-    /// The script's name of the runtime, and the packages for `pip install`; `./python` is in this
+    /// The script's name of the runtime, and the packages for `pip install`; `./bindings/python` is in this
     /// project's repository.
     fn name_and_packages(self) -> [&'static str; 2] {
         match self {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::config::Config;
 use crate::ranks::Reduce;
 use crate::record::progress::{StepProgress, say};
-use crate::run::data::{RunData, protect_inputs};
+use crate::run::data::{TrainingData, protect_inputs};
 use crate::tools::chart::with_extension;
 use crate::tools::find_lr::{RateRange, sweep};
 use clap::Args;
@@ -91,7 +91,7 @@ pub fn run(arguments: Arguments, reduce: &Reduce) -> anyhow::Result<u8> {
             outputs.claim(&with_extension(&stem, extension)?, true)?;
         }
         outputs.prepare(Directories::Create)?;
-        RunData::open(&config)
+        TrainingData::open(&config)
     })?;
     for warning in &data.warnings {
         say(format!("warning: {}", printable(warning)));

@@ -26,7 +26,7 @@ use crate::ranks::NodeShare;
 
 /// The scenes and statistics of a run.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct RunData {
+pub struct TrainingData {
     /// Channels of the files.
     pub layout: ChannelLayout,
     /// Training scenes.
@@ -107,7 +107,7 @@ pub fn share_loader(
     BatchLoader::of_numbers(source, step * own, number)
 }
 
-impl RunData {
+impl TrainingData {
     /// Opens the data set and reads every scene once, so that an invalid one is found before the
     /// first step. The seed draws the validation scenes.
     ///
@@ -157,7 +157,7 @@ impl RunData {
         let checksums = checksums(train.iter().chain(&validation).chain(&test))?;
         let mut warnings = content::by_problem(&suspicious);
         warnings.extend(copies(&checksums));
-        Ok(RunData {
+        Ok(TrainingData {
             layout,
             train,
             validation,

@@ -12,7 +12,7 @@ use demc_model::config::COLOR_CHANNELS;
 use demc_program::message::duration;
 
 use crate::config::Config;
-use crate::run::data::RunData;
+use crate::run::data::TrainingData;
 use crate::run::initial::random_network;
 use crate::step::optimizer::Optimizer;
 use crate::step::trainer::Trainer;
@@ -50,7 +50,7 @@ impl DurationEstimate {
     /// time per step. With `data.batch_size = 1` the four are micro-batches.
     pub fn measure(
         config: &Config,
-        data: &RunData,
+        data: &TrainingData,
         first_step: u64,
         device: &Device,
         processes: usize,

@@ -22,9 +22,9 @@ use demc_program::file::{remove_abandoned, write_whole};
 use crate::config::Config;
 use crate::record::metrics_log::METRICS;
 use crate::run::checkpoint::store::CheckpointStore;
-use crate::run::data::RunData;
+use crate::run::data::TrainingData;
 use crate::run::own_files::{CONFIG, LAYOUT, OWN_FILES, RUN, is_usable};
-use crate::run::run_record::{RunFacts, RunRecord};
+use crate::run::run_record::{RecordedSetup, RunRecord};
 
 /// Locked by the training process.
 const LOCK: &str = "lock";
@@ -110,7 +110,7 @@ impl RunDir {
     ///
     /// # Errors
     /// Each scene that differs, by name.
-    pub fn check_scenes(&self, data: &RunData) -> anyhow::Result<()> {
+    pub fn check_scenes(&self, data: &TrainingData) -> anyhow::Result<()> {
         let path = self.path.join(RUN);
         match read_record(&path)? {
             StoredRecord::Intact(record) => record.check_scenes(&path, data),
@@ -148,8 +148,8 @@ impl RunDir {
     pub fn open(
         &mut self,
         config: &Config,
-        data: &RunData,
-        facts: RunFacts,
+        data: &TrainingData,
+        facts: RecordedSetup,
     ) -> anyhow::Result<Vec<String>> {
         let made = fs::create_dir_all(&self.path);
         made.with_context(|| format!("cannot create {}", self.path.display()))?;

@@ -8,7 +8,7 @@ use demc_data::{ChannelLayout, Normalizer, Scene};
 use demc_program::message::short_list;
 use serde::{Deserialize, Serialize};
 
-use crate::run::data::RunData;
+use crate::run::data::TrainingData;
 use crate::run::initial::InitialWeights;
 
 /// The manifest that pins the version of Burn; Burn itself exports none.
@@ -49,7 +49,7 @@ struct SceneNames {
 }
 
 impl SceneNames {
-    fn of(data: &RunData) -> Self {
+    fn of(data: &TrainingData) -> Self {
         let names = |scenes: &[Scene]| scenes.iter().map(|scene| scene.name.clone()).collect();
         SceneNames {
             train: names(&data.train),
@@ -75,7 +75,7 @@ impl SceneNames {
 
 /// What `run.json` records besides the data.
 #[derive(Clone, Copy, Debug)]
-pub struct RunFacts<'a> {
+pub struct RecordedSetup<'a> {
     /// Name of the device.
     pub device: &'a str,
     /// Implementation of the operations.
@@ -90,7 +90,7 @@ pub struct RunFacts<'a> {
 
 impl RunRecord {
     /// The record of a run that starts now.
-    pub fn new(data: &RunData, facts: RunFacts) -> Self {
+    pub fn new(data: &TrainingData, facts: RecordedSetup) -> Self {
         RunRecord {
             demc: env!("CARGO_PKG_VERSION").to_string(),
             burn: burn_version(),
@@ -111,7 +111,7 @@ impl RunRecord {
     ///
     /// # Errors
     /// Other scenes or splits; a scene whose file changed.
-    pub fn check_scenes(&self, path: &Path, data: &RunData) -> anyhow::Result<()> {
+    pub fn check_scenes(&self, path: &Path, data: &TrainingData) -> anyhow::Result<()> {
         let now = SceneNames::of(data);
         let (then, now_entries) = (self.scenes.entries(), now.entries());
         let moved: BTreeSet<&str> = then
@@ -143,7 +143,7 @@ impl RunRecord {
     ///
     /// # Errors
     /// As [`check_scenes`](Self::check_scenes); other statistics or another layout.
-    pub fn check_data(&self, path: &Path, data: &RunData) -> anyhow::Result<()> {
+    pub fn check_data(&self, path: &Path, data: &TrainingData) -> anyhow::Result<()> {
         self.check_scenes(path, data)?;
         for (what, same) in [
             // The order decides over the batches.

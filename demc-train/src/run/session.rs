@@ -14,7 +14,7 @@ use crate::ranks::cluster::ClusterEstimate;
 use crate::ranks::{NodeShare, check_divides};
 use crate::run::checkpoint::store::{CheckpointSearch, CheckpointStore};
 use crate::run::checkpoint::{self, Checkpoint};
-use crate::run::data::{RunData, protect_inputs};
+use crate::run::data::{TrainingData, protect_inputs};
 use crate::run::estimate::{DurationEstimate, check_memory};
 use crate::run::observer::TakenStep;
 use crate::run::place::SessionPlace;
@@ -204,7 +204,7 @@ impl Session {
 /// What a session works on.
 struct Opened {
     dir: RunDir,
-    data: RunData,
+    data: TrainingData,
     checkpoint: Option<OpenedCheckpoint>,
     notes: Vec<String>,
 }
@@ -217,7 +217,7 @@ struct OpenedCheckpoint {
 /// What the first process tells the others.
 #[derive(Serialize, Deserialize)]
 struct OpenedMessage {
-    data: RunData,
+    data: TrainingData,
     /// The directory of the checkpoint to resume from.
     checkpoint: Option<PathBuf>,
     notes: Vec<String>,
@@ -238,7 +238,7 @@ impl Opened {
         } else {
             None
         };
-        let data = RunData::open(config)?;
+        let data = TrainingData::open(config)?;
         if resume {
             dir.check_scenes(&data)?;
         }

@@ -8,8 +8,8 @@ use demc_infer::bundle::Bundle;
 use demc_model::Denoiser;
 
 use crate::config::Config;
-use crate::run::checkpoint::{Checkpoint, LoopState};
-use crate::run::data::RunData;
+use crate::run::checkpoint::{Checkpoint, TrainingProgress};
+use crate::run::data::TrainingData;
 use crate::run::initial::{InitialNetwork, InitialWeights, initial_network};
 use crate::step::optimizer::Optimizer;
 
@@ -19,7 +19,7 @@ pub(super) struct StartingPoint {
     pub(super) albedo_filter: Option<Box<Bundle>>,
     pub(super) average: Option<Denoiser>,
     pub(super) optimizer: Optimizer,
-    pub(super) state: LoopState,
+    pub(super) state: TrainingProgress,
     pub(super) initial: Option<InitialWeights>,
 }
 
@@ -27,7 +27,7 @@ impl StartingPoint {
     /// Step 0. The ranges of the initial weights' scenes are added to those of `data`.
     pub(super) fn of_new_run(
         config: &Config,
-        data: &mut RunData,
+        data: &mut TrainingData,
         device: &Device,
     ) -> anyhow::Result<Self> {
         let InitialNetwork {
@@ -44,7 +44,7 @@ impl StartingPoint {
             albedo_filter,
             average: None,
             optimizer: Optimizer::new(config),
-            state: LoopState::start(),
+            state: TrainingProgress::start(),
             initial: weights,
         })
     }
@@ -53,7 +53,7 @@ impl StartingPoint {
     pub(super) fn of_checkpoint(
         checkpoint: Checkpoint,
         config: &Config,
-        data: &mut RunData,
+        data: &mut TrainingData,
         run: &Path,
     ) -> anyhow::Result<Self> {
         let Checkpoint {

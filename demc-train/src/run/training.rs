@@ -16,18 +16,18 @@ use crate::ranks::Reduce;
 use crate::record::metrics_log::MetricsLine;
 use crate::record::recorder::{Recorder, timed};
 use crate::run::checkpoint::store::CheckpointStore;
-use crate::run::checkpoint::{self, Checkpoint, LoopState, MetricSums, SessionClock};
-use crate::run::data::{RunData, share_loader};
+use crate::run::checkpoint::{self, Checkpoint, MetricSums, SessionClock, TrainingProgress};
+use crate::run::data::{TrainingData, share_loader};
 use crate::run::estimate::DurationEstimate;
 use crate::run::initial::InitialWeights;
 use crate::run::observer::TakenStep;
 use crate::run::place::SessionPlace;
 use crate::run::run_dir::RunDir;
-use crate::run::run_record::RunFacts;
+use crate::run::run_record::RecordedSetup;
 use crate::run::signals::Stopped;
 use crate::run::starting_point::StartingPoint;
 use crate::run::validation::Validation;
-use crate::run::warnings::LoopFacts;
+use crate::run::warnings::WarningContext;
 use crate::step::optimizer::DormantChannels;
 use crate::step::trainer::{StepReport, Trainer};
 
@@ -37,13 +37,13 @@ const MAX_SKIPPED: u64 = 100;
 /// A run that can train.
 pub struct TrainingRun {
     config: Config,
-    data: RunData,
+    data: TrainingData,
     dir: RunDir,
     source: Arc<PatchSource>,
     trainer: Trainer,
     /// The albedo filter of `train.init`: of the training scenes, and in every bundle of the run.
     albedo_filter: Option<Box<Bundle>>,
-    state: LoopState,
+    state: TrainingProgress,
     /// The weights of `train.init`, if the run is new.
     initial: Option<InitialWeights>,
     /// Steps skipped since the last one that was taken.
@@ -59,7 +59,7 @@ impl TrainingRun {
     /// Scenes smaller than a patch; a checkpoint of another run; a `train.init` of another network.
     pub fn new(
         config: Config,
-        mut data: RunData,
+        mut data: TrainingData,
         dir: RunDir,
         checkpoint: Option<Checkpoint>,
         place: &SessionPlace,
@@ -213,7 +213,7 @@ impl TrainingRun {
         if !self.reduce.is_first() {
             return Ok(Recorder::silent());
         }
-        let facts = RunFacts {
+        let facts = RecordedSetup {
             device,
             operations: &self.trainer.operations(),
             parameters: self.parameters(),
@@ -257,7 +257,7 @@ impl TrainingRun {
         sums.steps += 1;
         sums.loss += report.loss;
         sums.grad_norm += report.grad_norm;
-        let facts = LoopFacts {
+        let facts = WarningContext {
             steps: self.config.train.steps,
             patches: self.source.patches().len() as u64,
             scenes,

@@ -47,7 +47,7 @@ enum WarningTopic {
 /// The state of the warnings of a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct RunMonitor {
+pub struct WarningState {
     /// Steps and sum of the losses of the current window.
     window: (u64, f64),
     windows: u64,
@@ -63,7 +63,7 @@ pub struct RunMonitor {
 
 /// What the warnings need to know about a run.
 #[derive(Clone, Copy, Debug)]
-pub struct LoopFacts<'a> {
+pub struct WarningContext<'a> {
     /// Steps of the run.
     pub steps: u64,
     /// Patches per epoch.
@@ -72,11 +72,11 @@ pub struct LoopFacts<'a> {
     pub scenes: &'a [String],
 }
 
-impl RunMonitor {
+impl WarningState {
     /// Adds the loss of a step, and of each of its patches by scene. Returns warnings.
     pub fn step(
         &mut self,
-        facts: LoopFacts,
+        facts: WarningContext,
         loss: f64,
         patches: impl Iterator<Item = (usize, f64)>,
     ) -> Vec<String> {
@@ -233,12 +233,12 @@ mod tests {
 
     fn run(losses: impl Iterator<Item = f64>, scenes: usize) -> Vec<String> {
         let names = names(scenes);
-        let facts = LoopFacts {
+        let facts = WarningContext {
             steps: 5000,
             patches: 100,
             scenes: &names,
         };
-        let mut watch = RunMonitor::default();
+        let mut watch = WarningState::default();
         losses
             .enumerate()
             .flat_map(|(i, loss)| watch.step(facts, loss, [(i % scenes, loss)].into_iter()))
@@ -247,7 +247,7 @@ mod tests {
 
     #[test]
     fn many_dormant_channels_are_reported_once() {
-        let mut watch = RunMonitor::default();
+        let mut watch = WarningState::default();
         assert_eq!(watch.dormant(0.1), None);
         let said = watch.dormant(0.42).unwrap();
         assert!(said.starts_with("42 % of the network's channels are dormant"));
@@ -307,7 +307,7 @@ mod tests {
 
     #[test]
     fn dead_channels_and_a_zero_output_are_reported_once() {
-        let mut watch = RunMonitor::default();
+        let mut watch = WarningState::default();
         let health = |dead_channels, zero_share| NetworkHealth {
             dead_channels,
             zero_share,
@@ -321,15 +321,15 @@ mod tests {
 
     #[test]
     fn the_state_survives_a_checkpoint() {
-        let mut watch = RunMonitor::default();
+        let mut watch = WarningState::default();
         let names = names(3);
-        let facts = LoopFacts {
+        let facts = WarningContext {
             steps: 10,
             patches: 9,
             scenes: &names,
         };
         watch.step(facts, 0.1 + 0.2, [(2, 0.7)].into_iter());
         let text = serde_json::to_string(&watch).unwrap();
-        assert_eq!(serde_json::from_str::<RunMonitor>(&text).unwrap(), watch);
+        assert_eq!(serde_json::from_str::<WarningState>(&text).unwrap(), watch);
     }
 }

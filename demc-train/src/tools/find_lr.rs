@@ -13,7 +13,7 @@ use demc_data::Batch;
 use demc_program::file::write_whole;
 
 use crate::config::Config;
-use crate::run::data::{RunData, share_loader};
+use crate::run::data::{TrainingData, share_loader};
 use crate::run::estimate::check_memory;
 use crate::run::initial::{InitialNetwork, initial_network};
 use crate::run::place::SessionPlace;
@@ -78,7 +78,7 @@ pub struct Sweep {
 /// A scene that cannot be read; a `train.init` of another network.
 pub fn sweep(
     config: &Config,
-    data: &RunData,
+    data: &TrainingData,
     range: RateRange,
     place: &SessionPlace,
     mut on_step: impl FnMut(&SweepPoint),

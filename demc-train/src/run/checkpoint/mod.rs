@@ -31,7 +31,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
 use crate::run::own_files::{OWN_FILES, is_usable};
-use crate::run::warnings::RunMonitor;
+use crate::run::warnings::WarningState;
 use crate::step::optimizer::Optimizer;
 use store::CheckpointStore;
 
@@ -43,7 +43,7 @@ const STATE: &str = "state.json";
 /// The state of the training loop between two steps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct LoopState {
+pub struct TrainingProgress {
     /// [`FORMAT`].
     pub format: u32,
     /// Steps of the run so far, skipped ones included.
@@ -55,7 +55,7 @@ pub struct LoopState {
     /// Sums for the next line of `metrics.jsonl`.
     pub since_log: MetricSums,
     /// State of the warnings.
-    pub watch: RunMonitor,
+    pub watch: WarningState,
     /// Seconds of training, without the time between sessions.
     pub elapsed_s: f64,
 }
@@ -80,16 +80,16 @@ pub struct MetricSums {
     pub grad_norm: f64,
 }
 
-impl LoopState {
+impl TrainingProgress {
     /// The state before the first step.
     pub fn start() -> Self {
-        LoopState {
+        TrainingProgress {
             format: FORMAT,
             step: 0,
             skipped: 0,
             best: None,
             since_log: MetricSums::default(),
-            watch: RunMonitor::default(),
+            watch: WarningState::default(),
             elapsed_s: 0.0,
         }
     }
@@ -151,7 +151,7 @@ pub struct Checkpoint {
     /// The optimizer.
     pub optimizer: Optimizer,
     /// The training loop.
-    pub state: LoopState,
+    pub state: TrainingProgress,
 }
 
 /// Writes a checkpoint of the run in `run`: the network in training and the averaged one, without
@@ -164,7 +164,7 @@ pub fn save(
     bundle: &Bundle,
     average: Option<&Bundle>,
     optimizer: &Optimizer,
-    state: &LoopState,
+    state: &TrainingProgress,
     keep: usize,
 ) -> anyhow::Result<()> {
     let bytes = |bundle: &Bundle| bundle.to_bytes(Names::Burn, Precision::F32);
@@ -227,7 +227,7 @@ pub fn load(dir: &Path, config: &Config, device: &Device) -> anyhow::Result<Chec
     })
 }
 
-fn read_state(path: &Path) -> anyhow::Result<LoopState> {
+fn read_state(path: &Path) -> anyhow::Result<TrainingProgress> {
     let text = fs::read_to_string(path).with_context(|| path.display().to_string())?;
     let version: serde_json::Value =
         serde_json::from_str(&text).with_context(|| path.display().to_string())?;
