@@ -12,7 +12,7 @@ from pathlib import Path
 
 from test_render import MISSING, run
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 COUNTS = (1, 4, 16, 64, 256)
 SCENES = ("--rooms", 2, "--stills", 1, "--views", 1, "--reserved", "--split", "test", "--seed", 8, "--size", 96)
 
