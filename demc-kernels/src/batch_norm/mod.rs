@@ -162,25 +162,11 @@ pub fn backward(
         unsafe { simd::run(tasks::streaming(isa), leaf) }
     });
 
-    // Let g be dy behind the gate, n the pixels, and s = 1 / sqrt(variance + epsilon).
-    //
-    // dbeta = sum g, dgamma = s sum g (x - mean).
-    //
-    // dx = gamma s (g - dbeta / n - (x - mean) s dgamma / n).
-    let pixels = (x.len() / channels) as f64;
-    let scale = scales(gamma, variance, epsilon);
-    let (mut slope, mut shift) = (vec![0.0; channels], vec![0.0; channels]);
-    for c in 0..channels {
-        let [plain, by_x] = sums.iter().fold([0.0; 2], |sum, block| {
-            [sum[0] + block[c][0], sum[1] + block[c][1]]
-        });
-        let s = inverse_deviation(variance[c], epsilon);
-        dbeta[c] = plain as f32;
-        dgamma[c] = (s * by_x) as f32;
-        slope[c] = (-f64::from(scale[c]) * s * s * by_x / pixels) as f32;
-        shift[c] = (-f64::from(scale[c]) * plain / pixels) as f32;
-    }
-    let [scale, slope, shift] = [&scale, &slope, &shift].map(|values| rows.repeated(values));
+    let found = ChannelGradients::new(x.len() / channels, gamma, variance, epsilon, &sums);
+    dgamma.copy_from_slice(&found.dgamma);
+    dbeta.copy_from_slice(&found.dbeta);
+    let [scale, slope, shift] =
+        [&found.scale, &found.slope, &found.shift].map(|values| rows.repeated(values));
     let [scale, slope, shift] = [&scale[..], &slope, &shift];
     tasks::each(
         maps().zip(dx.chunks_mut(rows.block)),
@@ -200,6 +186,53 @@ pub fn backward(
             unsafe { simd::run(tasks::streaming(isa), leaf) }
         },
     );
+}
+
+/// What sums over all pixels determine, for each channel. Let g be dy behind the gate, n the pixels,
+/// and s = 1 / sqrt(variance + epsilon). Then
+///
+/// dbeta = sum g, dgamma = s sum g (x - mean),
+///
+/// dx = gamma s (g - dbeta / n - (x - mean) s dgamma / n) = scale g + shift + slope (x - mean).
+struct ChannelGradients {
+    dgamma: Vec<f32>,
+    dbeta: Vec<f32>,
+    scale: Vec<f32>,
+    slope: Vec<f32>,
+    shift: Vec<f32>,
+}
+
+impl ChannelGradients {
+    /// From the sums of g and of g (x - mean) over each block.
+    fn new(
+        pixels: usize,
+        gamma: &[f32],
+        variance: &[f32],
+        epsilon: f32,
+        blocks: &[Vec<[f64; 2]>],
+    ) -> Self {
+        let pixels = pixels as f64;
+        let zeros = || vec![0.0; gamma.len()];
+        let mut found = ChannelGradients {
+            dgamma: zeros(),
+            dbeta: zeros(),
+            scale: scales(gamma, variance, epsilon),
+            slope: zeros(),
+            shift: zeros(),
+        };
+        for c in 0..gamma.len() {
+            let [plain, by_x] = blocks.iter().fold([0.0; 2], |sum, block| {
+                [sum[0] + block[c][0], sum[1] + block[c][1]]
+            });
+            let s = inverse_deviation(variance[c], epsilon);
+            let scale = f64::from(found.scale[c]);
+            found.dbeta[c] = plain as f32;
+            found.dgamma[c] = (s * by_x) as f32;
+            found.slope[c] = (-scale * s * s * by_x / pixels) as f32;
+            found.shift[c] = (-scale * plain / pixels) as f32;
+        }
+        found
+    }
 }
 
 #[track_caller]

@@ -178,75 +178,122 @@ pub fn backward(
         inputs.iter().map(|(_, count)| count).sum::<usize>(),
         grid.pixels(),
     );
-    let wide = whole(outputs);
 
-    // The gated gradient with rows padded to whole vectors, and its sums over blocks.
+    let (gated, sums) = gated_gradient(isa, y, dy, pixels, outputs);
+    for (dbias, sum) in dbias.iter_mut().zip(sums) {
+        *dbias = sum as f32;
+    }
+    for ((dx, &(first, count)), x) in dxs.iter_mut().zip(&inputs).zip(xs) {
+        let Some(dx) = dx else { continue };
+        assert_eq!(dx.len(), x.len(), "an input's gradient");
+        let transposed = Packed::new(isa, outputs, count, |o, i| weight[o * total + first + i]);
+        input_gradient(isa, &gated, &transposed, [outputs, count], dx);
+    }
+    for (x, &(first, count)) in xs.iter().zip(&inputs) {
+        let products = weight_products(isa, x, &gated, [count, outputs], pixels);
+        dweight
+            .par_chunks_mut(total)
+            .enumerate()
+            .for_each(|(o, dweight)| {
+                for (i, dweight) in dweight[first..first + count].iter_mut().enumerate() {
+                    *dweight = products
+                        .iter()
+                        .map(|product| product[i * whole(outputs) + o])
+                        .sum();
+                }
+            });
+    }
+}
+
+/// The gated gradient `[pixels, channels]` with rows padded to whole vectors, and its sum over all
+/// pixels, for each channel.
+fn gated_gradient(
+    isa: Isa,
+    y: Option<&[f32]>,
+    dy: &[f32],
+    pixels: usize,
+    channels: usize,
+) -> (Scratch, Vec<f64>) {
+    let wide = whole(channels);
     let mut gated = Scratch::take(pixels * wide);
-    let mut biases = vec![0.0f64; pixels.div_ceil(BLOCK) * outputs];
+    let mut blocks = vec![0.0f64; pixels.div_ceil(BLOCK) * channels];
     gated
         .par_chunks_mut(BLOCK * wide)
-        .zip(biases.par_chunks_mut(outputs))
+        .zip(blocks.par_chunks_mut(channels))
         .enumerate()
         .for_each(|(task, (gated, sums))| {
-            let (first, count) = (task * BLOCK * outputs, gated.len() / wide);
+            let (first, count) = (task * BLOCK * channels, gated.len() / wide);
             copy(
                 isa,
                 Copy {
                     from: &dy[first..],
-                    from_step: outputs,
+                    from_step: channels,
                     gate: y.map(|y| &y[first..]),
                     bias: None,
                     relu: false,
                     target: gated,
                     target_step: wide,
                     rows: count,
-                    channels: outputs,
+                    channels,
                 },
             );
-            rows::column_sums(isa, gated, wide, count, outputs, sums);
+            rows::column_sums(isa, gated, wide, count, channels, sums);
         });
-    for (o, dbias) in dbias.iter_mut().enumerate() {
-        *dbias = biases[o..].iter().step_by(outputs).sum::<f64>() as f32;
-    }
+    let sum = |channel: usize| blocks[channel..].iter().step_by(channels).sum();
+    (gated, (0..channels).map(sum).collect())
+}
 
-    for ((dx, &(first, count)), x) in dxs.iter_mut().zip(&inputs).zip(xs) {
-        let Some(dx) = dx else { continue };
-        assert_eq!(dx.len(), x.len(), "an input's gradient");
-        let transposed = Packed::new(isa, outputs, count, |o, i| weight[o * total + first + i]);
-        dx.par_chunks_mut(BLOCK * count)
-            .enumerate()
-            .for_each(|(task, dx)| {
-                let rows = dx.len() / count;
-                let window = PaddedRows::new(&gated, wide, task * BLOCK, rows);
-                let c_step = whole(count);
-                let mut c = Scratch::take(padded_rows(rows) * c_step);
-                let term = Term {
-                    rows: window.rows(),
-                    step: wide,
-                    weight: &transposed,
-                };
-                rows::sum(isa, rows, &[term], &mut c, c_step);
-                copy(
-                    isa,
-                    Copy {
-                        from: &c,
-                        from_step: c_step,
-                        gate: None,
-                        bias: None,
-                        relu: false,
-                        target: dx,
-                        target_step: count,
-                        rows,
-                        channels: count,
-                    },
-                );
-            });
-    }
+/// `dx = gated * transposed`: the gradient of one input of `count` channels, from the gated gradient
+/// of `outputs` channels with padded rows.
+fn input_gradient(
+    isa: Isa,
+    gated: &[f32],
+    transposed: &Packed,
+    [outputs, count]: [usize; 2],
+    dx: &mut [f32],
+) {
+    let (wide, c_step) = (whole(outputs), whole(count));
+    dx.par_chunks_mut(BLOCK * count)
+        .enumerate()
+        .for_each(|(task, dx)| {
+            let rows = dx.len() / count;
+            let window = PaddedRows::new(gated, wide, task * BLOCK, rows);
+            let mut c = Scratch::take(padded_rows(rows) * c_step);
+            let term = Term {
+                rows: window.rows(),
+                step: wide,
+                weight: transposed,
+            };
+            rows::sum(isa, rows, &[term], &mut c, c_step);
+            copy(
+                isa,
+                Copy {
+                    from: &c,
+                    from_step: c_step,
+                    gate: None,
+                    bias: None,
+                    relu: false,
+                    target: dx,
+                    target_step: count,
+                    rows,
+                    channels: count,
+                },
+            );
+        });
+}
 
-    for (x, &(first, count)) in xs.iter().zip(&inputs) {
-        // Blocks of rows read past the last pixels, so those pixels are processed from a padded
-        // copy.
-        let outer = |a, b, pixels| Outer {
+/// Products `x^T * gated` over the pixels, whose sum is the gradient of the weight of one input:
+/// `count` rows, each padded to whole vectors of `outputs`.
+fn weight_products(
+    isa: Isa,
+    x: &[f32],
+    gated: &[f32],
+    [count, outputs]: [usize; 2],
+    pixels: usize,
+) -> Vec<Scratch> {
+    let wide = whole(outputs);
+    let product = |a: &[f32], b: &[f32], pixels| {
+        let outer = Outer {
             a,
             a_step: count,
             rows: count,
@@ -255,29 +302,20 @@ pub fn backward(
             columns: outputs,
             pixels,
         };
-        let mut products = Vec::with_capacity(2);
-        if pixels > 1 + 24_usize.div_ceil(count) {
-            let tail = 24_usize.div_ceil(count) + 1;
-            let body = pixels - tail;
-            products.push(rows::outer(isa, &[outer(x, &gated, body)], wide));
-            let end = PaddedRows::new(x, count, body, tail);
-            products.push(rows::outer(
-                isa,
-                &[outer(end.rows(), &gated[body * wide..], tail)],
-                wide,
-            ));
-        } else {
-            let all = PaddedRows::new(x, count, 0, pixels);
-            products.push(rows::outer(isa, &[outer(all.rows(), &gated, pixels)], wide));
-        }
-        dweight
-            .par_chunks_mut(total)
-            .enumerate()
-            .for_each(|(o, dweight)| {
-                for (i, dweight) in dweight[first..first + count].iter_mut().enumerate() {
-                    *dweight = products.iter().map(|product| product[i * wide + o]).sum();
-                }
-            });
+        rows::outer(isa, &[outer], wide)
+    };
+    // Blocks of rows read past the last pixels, so those pixels are processed from a padded copy.
+    let tail = 24_usize.div_ceil(count) + 1;
+    if pixels > tail {
+        let body = pixels - tail;
+        let end = PaddedRows::new(x, count, body, tail);
+        vec![
+            product(x, gated, body),
+            product(end.rows(), &gated[body * wide..], tail),
+        ]
+    } else {
+        let all = PaddedRows::new(x, count, 0, pixels);
+        vec![product(all.rows(), gated, pixels)]
     }
 }
 

@@ -1,11 +1,24 @@
 //! The cells of the output, and the padded copies that hold them contiguously.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use crate::product::padded_rows;
 use crate::rows::{self, BLOCK, Copy, copy, whole};
 use crate::scratch::Scratch;
 use crate::{Grid, Isa};
+
+/// Neighbouring cells of one line.
+pub(super) struct CellRun {
+    /// The first one, counted over all images.
+    pub(super) first: usize,
+    pub(super) image: usize,
+    pub(super) row: usize,
+    pub(super) column: usize,
+    /// Their number.
+    pub(super) count: usize,
+}
 
 #[derive(Clone, Copy)]
 pub(super) struct Cells {
@@ -27,6 +40,23 @@ impl Cells {
 
     pub(super) fn count(self) -> usize {
         self.grid.batch * self.of_image()
+    }
+
+    /// The cells of `range`, divided into runs within a line of cells.
+    pub(super) fn runs(self, range: Range<usize>) -> impl Iterator<Item = CellRun> {
+        let mut first = range.start;
+        std::iter::from_fn(move || {
+            let (line, column) = (first / self.across, first % self.across);
+            let run = CellRun {
+                first,
+                image: line / (self.grid.height + 1),
+                row: line % (self.grid.height + 1),
+                column,
+                count: (self.across - column).min(range.end.checked_sub(first)?),
+            };
+            first += run.count;
+            (run.count > 0).then_some(run)
+        })
     }
 
     /// The padded inputs: cell `m` reads row `m + offset(tap)` at tap `(dy, dx)`.

@@ -20,7 +20,7 @@ use crate::product::padded_rows;
 use crate::rows::{self, Copy, Outer, Packed, Term, copy, whole};
 use crate::scratch::{Scratch, Shared};
 use crate::{Grid, Isa};
-use cells::Cells;
+use cells::{CellRun, Cells};
 use weights::{TAPS, packed};
 
 /// `y = x * weight + bias`, rectified if `relu`.
@@ -132,7 +132,15 @@ impl<'a> PreparedDeconvolution<'a> {
         let padded = cells.inputs(isa, x, inputs);
         let wide = whole(4 * outputs);
         let step = rows::block_rows(cell_count);
-        let shared = Shared::new(y);
+        let target = OutputBand {
+            isa,
+            grid,
+            above,
+            height,
+            bias,
+            relu,
+            y: Shared::new(y),
+        };
         (0..cell_count.div_ceil(step))
             .into_par_iter()
             .for_each(|task| {
@@ -145,58 +153,76 @@ impl<'a> PreparedDeconvolution<'a> {
                 });
                 let mut c = Scratch::take(padded_rows(count) * wide);
                 rows::sum(isa, count, &terms, &mut c, wide);
-                // The cells of a row are contiguous in two rows of the output.
-                let mut cell = first;
-                while cell < first + count {
-                    let (line, column) = (cell / cells.across, cell % cells.across);
-                    let (image, row) = (line / (grid.height + 1), line % (grid.height + 1));
-                    let run = (cells.across - column).min(first + count - cell);
-                    for phase in 0..4 {
-                        let (py, px) = (phase / 2, phase % 2);
-                        let Some(y_row) = (2 * row + py)
-                            .checked_sub(1 + 2 * above)
-                            .filter(|y| *y < height)
-                        else {
-                            continue;
-                        };
-                        // Skips cells whose pixel 2 * column + px - 1 does not exist.
-                        let skipped = usize::from(2 * column + px == 0);
-                        let past = usize::from(2 * (column + run - 1) + px > 2 * grid.width);
-                        if skipped + past >= run {
-                            continue;
-                        }
-                        let rows = run - skipped - past;
-                        let pixel =
-                            (image * height + y_row) * 2 * grid.width + 2 * (column + skipped) + px
-                                - 1;
-                        let len = ((rows - 1) * 2 + 1) * outputs;
-                        // SAFETY: tasks write the pixels of different cells, and a phase is one
-                        // pixel of a cell. The slice also spans pixels of other phases, which only
-                        // this task's own loop writes.
-                        let target = unsafe {
-                            std::slice::from_raw_parts_mut(
-                                shared.pointer().add(pixel * outputs),
-                                len,
-                            )
-                        };
-                        copy(
-                            isa,
-                            Copy {
-                                from: &c[(cell - first + skipped) * wide + phase * outputs..],
-                                from_step: wide,
-                                gate: None,
-                                bias: Some(bias),
-                                relu,
-                                target,
-                                target_step: 2 * outputs,
-                                rows,
-                                channels: outputs,
-                            },
-                        );
-                    }
-                    cell += run;
+                for run in cells.runs(first..first + count) {
+                    let sums = &c[(run.first - first) * wide..];
+                    // SAFETY: tasks write different cells.
+                    unsafe { target.write(&run, sums) }
                 }
             });
+    }
+}
+
+/// Some rows of the output, written cell by cell: each has four pixels, its *phases*.
+struct OutputBand<'a> {
+    isa: Isa,
+    /// Grid of the input.
+    grid: Grid,
+    /// Rows of the input above the band.
+    above: usize,
+    /// Rows of the output.
+    height: usize,
+    bias: &'a [f32],
+    relu: bool,
+    y: Shared,
+}
+
+impl OutputBand<'_> {
+    /// Writes the pixels of a run of cells. `sums` `[cells, 4 out]`, each padded to whole vectors.
+    ///
+    /// # Safety
+    /// No other thread writes these cells.
+    unsafe fn write(&self, run: &CellRun, sums: &[f32]) {
+        let (width, height) = (2 * self.grid.width, self.height);
+        let outputs = self.bias.len();
+        let wide = whole(4 * outputs);
+        // The cells of a row are contiguous in two rows of the output.
+        for phase in 0..4 {
+            let (py, px) = (phase / 2, phase % 2);
+            let Some(y_row) = (2 * run.row + py)
+                .checked_sub(1 + 2 * self.above)
+                .filter(|y| *y < height)
+            else {
+                continue;
+            };
+            // Skips cells whose pixel 2 * column + px - 1 does not exist.
+            let skipped = usize::from(2 * run.column + px == 0);
+            let past = usize::from(2 * (run.column + run.count - 1) + px > width);
+            if skipped + past >= run.count {
+                continue;
+            }
+            let rows = run.count - skipped - past;
+            let pixel = (run.image * height + y_row) * width + 2 * (run.column + skipped) + px - 1;
+            let len = ((rows - 1) * 2 + 1) * outputs;
+            // SAFETY: a phase is one pixel of a cell, and the cells are this caller's. The slice also
+            // spans pixels of other phases, which only this loop writes.
+            let target = unsafe {
+                std::slice::from_raw_parts_mut(self.y.pointer().add(pixel * outputs), len)
+            };
+            copy(
+                self.isa,
+                Copy {
+                    from: &sums[skipped * wide + phase * outputs..],
+                    from_step: wide,
+                    gate: None,
+                    bias: Some(self.bias),
+                    relu: self.relu,
+                    target,
+                    target_step: 2 * outputs,
+                    rows,
+                    channels: outputs,
+                },
+            );
+        }
     }
 }
 
@@ -239,59 +265,7 @@ pub fn backward(
     if let Some(dx) = dx {
         assert_eq!(dx.len(), x.len(), "an input's gradient");
         let weights = packed(isa, weight, inputs, outputs, true);
-        let c_step = whole(inputs);
-        let step = rows::block_rows(cells.count());
-        let shared = Shared::new(dx);
-        (0..cells.count().div_ceil(step))
-            .into_par_iter()
-            .for_each(|task| {
-                let first = task * step;
-                let count = step.min(cells.count() - first);
-                let terms: [Term; 4] = std::array::from_fn(|t| {
-                    let (dy, dx) = TAPS[t];
-                    Term {
-                        rows: &gradients[(first + dy * cells.across + dx) * wide..],
-                        step: wide,
-                        weight: &weights[t],
-                    }
-                });
-                let mut c = Scratch::take(padded_rows(count) * c_step);
-                rows::sum(isa, count, &terms, &mut c, c_step);
-                // All cells of a row but the last are pixels of the input, in all rows but the
-                // last.
-                let mut cell = first;
-                while cell < first + count {
-                    let (line, column) = (cell / cells.across, cell % cells.across);
-                    let (image, row) = (line / (grid.height + 1), line % (grid.height + 1));
-                    let run = (cells.across - column).min(first + count - cell);
-                    let rows = run.min(grid.width - column);
-                    if row < grid.height && rows > 0 {
-                        let pixel = (image * grid.height + row) * grid.width + column;
-                        // SAFETY: tasks write different pixels.
-                        let target = unsafe {
-                            std::slice::from_raw_parts_mut(
-                                shared.pointer().add(pixel * inputs),
-                                rows * inputs,
-                            )
-                        };
-                        copy(
-                            isa,
-                            Copy {
-                                from: &c[(cell - first) * c_step..],
-                                from_step: c_step,
-                                gate: None,
-                                bias: None,
-                                relu: false,
-                                target,
-                                target_step: inputs,
-                                rows,
-                                channels: inputs,
-                            },
-                        );
-                    }
-                    cell += run;
-                }
-            });
+        input_gradient(isa, cells, &gradients, wide, &weights, inputs, dx);
     }
 
     let padded = cells.inputs(isa, x, inputs);
@@ -317,6 +291,67 @@ pub fn backward(
                     let (y, x) = (t / 4, t % 4);
                     *dweight = rows[y / 2 * 2 + x / 2][(y % 2 * 2 + x % 2) * outputs + output];
                 }
+            }
+        });
+}
+
+/// Writes `dx` `[B, H, W, in]` from the gradients of the cells, `[cells, wide]`.
+fn input_gradient(
+    isa: Isa,
+    cells: Cells,
+    gradients: &[f32],
+    wide: usize,
+    weights: &[Packed; 4],
+    inputs: usize,
+    dx: &mut [f32],
+) {
+    let grid = cells.grid;
+    let c_step = whole(inputs);
+    let step = rows::block_rows(cells.count());
+    let shared = Shared::new(dx);
+    (0..cells.count().div_ceil(step))
+        .into_par_iter()
+        .for_each(|task| {
+            let first = task * step;
+            let count = step.min(cells.count() - first);
+            let terms: [Term; 4] = std::array::from_fn(|t| {
+                let (dy, dx) = TAPS[t];
+                Term {
+                    rows: &gradients[(first + dy * cells.across + dx) * wide..],
+                    step: wide,
+                    weight: &weights[t],
+                }
+            });
+            let mut c = Scratch::take(padded_rows(count) * c_step);
+            rows::sum(isa, count, &terms, &mut c, c_step);
+            for run in cells.runs(first..first + count) {
+                // All cells of a row but the last are pixels of the input, in all rows but the last.
+                let rows = run.count.min(grid.width - run.column);
+                if run.row == grid.height || rows == 0 {
+                    continue;
+                }
+                let pixel = (run.image * grid.height + run.row) * grid.width + run.column;
+                // SAFETY: tasks write different pixels.
+                let target = unsafe {
+                    std::slice::from_raw_parts_mut(
+                        shared.pointer().add(pixel * inputs),
+                        rows * inputs,
+                    )
+                };
+                copy(
+                    isa,
+                    Copy {
+                        from: &c[(run.first - first) * c_step..],
+                        from_step: c_step,
+                        gate: None,
+                        bias: None,
+                        relu: false,
+                        target,
+                        target_step: inputs,
+                        rows,
+                        channels: inputs,
+                    },
+                );
             }
         });
 }

@@ -11,6 +11,8 @@
 mod collect;
 mod gather;
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use super::parts::{Axes, BiasRelu, GatedMap};
@@ -136,51 +138,23 @@ pub(crate) fn gradient(
         gate,
         channels: outputs,
     };
-    // The neighbourhoods of the thin side become rows.
-    let by_output = 9 * outputs <= MOST_COLLECTED && inputs > outputs;
-    let (rows, columns) = if by_output {
-        (inputs, 9 * outputs)
-    } else {
-        (9 * inputs, outputs)
-    };
-    // An extra row of ones: its gradient is the sum of `dy`, which is the gradient of the bias.
-    let (tall, wide) = (padded_rows(rows + 1), whole(columns));
+    let products = WeightProducts::new(isa, grid, x, dy);
+    let WeightProducts {
+        by_output,
+        rows,
+        columns,
+        ..
+    } = products;
     let pixels = grid.pixels();
     let stretch = pixels.div_ceil(STRETCHES).next_multiple_of(BLOCK);
     let stretches = pixels.div_ceil(stretch);
-    let size = tall * wide;
+    let wide = whole(columns);
+    let size = padded_rows(rows + 1) * wide;
     let mut sums = Scratch::zeroed(stretches * size);
     sums.par_chunks_mut(size)
         .enumerate()
         .for_each(|(index, sum)| {
-            let end = ((index + 1) * stretch).min(pixels);
-            let mut a = Scratch::zeroed(BLOCK * tall);
-            a.iter_mut()
-                .skip(rows)
-                .step_by(tall)
-                .for_each(|one| *one = 1.0);
-            let mut b = Scratch::zeroed(BLOCK * wide);
-            for first in (index * stretch..end).step_by(BLOCK) {
-                let range = first..(first + BLOCK).min(end);
-                let count = range.len();
-                if by_output {
-                    x.copy(isa, range.clone(), &mut a, tall);
-                    dy.gather(isa, grid, range, true, &mut b, wide);
-                } else {
-                    x.gather(isa, grid, range.clone(), false, &mut a, tall);
-                    dy.copy(isa, range, &mut b, wide);
-                }
-                let products = Outer {
-                    a: &a,
-                    a_step: tall,
-                    rows: rows + 1,
-                    b: &b,
-                    b_step: wide,
-                    columns,
-                    pixels: count,
-                };
-                rows::add_outer(isa, products, sum, wide);
-            }
+            products.add(index * stretch..((index + 1) * stretch).min(pixels), sum);
         });
     let total = |row: usize, column: usize| -> f32 {
         (0..stretches)
@@ -199,5 +173,77 @@ pub(crate) fn gradient(
         }
         // The middle tap of the neighbourhoods of `dy` is `dy` itself.
         dbias[o] = total(rows, if by_output { 4 * outputs + o } else { o });
+    }
+}
+
+/// The products whose sum over the pixels is the gradient of the weight. The neighbourhoods of the
+/// thin side become their rows or columns.
+#[derive(Clone, Copy)]
+struct WeightProducts<'a> {
+    isa: Isa,
+    grid: Grid,
+    x: GatedMap<'a>,
+    dy: GatedMap<'a>,
+    /// Neighbourhoods of `dy` beside pixels of `x`; otherwise the reverse.
+    by_output: bool,
+    /// Rows, without an extra row of ones: its product is the sum of `dy`, the gradient of the bias.
+    rows: usize,
+    columns: usize,
+}
+
+impl<'a> WeightProducts<'a> {
+    fn new(isa: Isa, grid: Grid, x: GatedMap<'a>, dy: GatedMap<'a>) -> Self {
+        let (inputs, outputs) = (x.channels, dy.channels);
+        let by_output = 9 * outputs <= MOST_COLLECTED && inputs > outputs;
+        let (rows, columns) = if by_output {
+            (inputs, 9 * outputs)
+        } else {
+            (9 * inputs, outputs)
+        };
+        WeightProducts {
+            isa,
+            grid,
+            x,
+            dy,
+            by_output,
+            rows,
+            columns,
+        }
+    }
+
+    /// Adds the products of these pixels to `sum`: `rows + 1` rows, each padded to whole vectors of
+    /// `columns`.
+    fn add(&self, pixels: Range<usize>, sum: &mut [f32]) {
+        let WeightProducts {
+            isa, grid, x, dy, ..
+        } = *self;
+        let (tall, wide) = (padded_rows(self.rows + 1), whole(self.columns));
+        let mut a = Scratch::zeroed(BLOCK * tall);
+        a.iter_mut()
+            .skip(self.rows)
+            .step_by(tall)
+            .for_each(|one| *one = 1.0);
+        let mut b = Scratch::zeroed(BLOCK * wide);
+        for first in pixels.clone().step_by(BLOCK) {
+            let range = first..(first + BLOCK).min(pixels.end);
+            let count = range.len();
+            if self.by_output {
+                x.copy(isa, range.clone(), &mut a, tall);
+                dy.gather(isa, grid, range, true, &mut b, wide);
+            } else {
+                x.gather(isa, grid, range.clone(), false, &mut a, tall);
+                dy.copy(isa, range, &mut b, wide);
+            }
+            let products = Outer {
+                a: &a,
+                a_step: tall,
+                rows: self.rows + 1,
+                b: &b,
+                b_step: wide,
+                columns: self.columns,
+                pixels: count,
+            };
+            rows::add_outer(isa, products, sum, wide);
+        }
     }
 }

@@ -191,32 +191,60 @@ pub(crate) fn gradient<const IN: usize>(
         "the gate of a map of {} values",
         dy.len()
     );
-    let (source, dy) = (
-        GatedMap {
-            map: x,
-            gate: None,
-            channels: inputs,
-        },
-        GatedMap {
-            map: dy,
-            gate,
-            channels: outputs,
-        },
-    );
-    let tiles = WinogradTiles::new(grid, IN - 2);
+    let source = GatedMap {
+        map: x,
+        gate: None,
+        channels: inputs,
+    };
+    let dy = GatedMap {
+        map: dy,
+        gate,
+        channels: outputs,
+    };
+    let (u, sums) = transformed_gradient::<IN>(isa, WinogradTiles::new(grid, IN - 2), source, dy);
+    let wide = padded(isa, outputs);
+    for (o, dbias) in dbias.iter_mut().enumerate() {
+        let sum: f64 = sums[o..].iter().step_by(wide).map(|x| f64::from(*x)).sum();
+        *dbias = sum as f32;
+    }
+    let axes = Axes::new(outputs, inputs, false);
+    let target = Shared::new(dweight);
+    let step = (8192 / outputs).max(1);
+    (0..inputs.div_ceil(step)).into_par_iter().for_each(|task| {
+        let leaf = Unpack::<IN> {
+            gradient: &u,
+            place_step: place_step(padded_rows(inputs) * wide),
+            row_step: wide,
+            axes,
+            rows: task * step..((task + 1) * step).min(inputs),
+            target,
+        };
+        // SAFETY: tasks write the weights of different inputs.
+        unsafe { run(isa, leaf) }
+    });
+}
+
+/// The gradient of the transformed weight, `IN * IN` places of `[in, out]` with padding, and the sums
+/// of `dy` over stretches of [`TASK_TILES`] tiles, `[stretches, out]` with padding.
+fn transformed_gradient<const IN: usize>(
+    isa: Isa,
+    tiles: WinogradTiles,
+    x: GatedMap,
+    dy: GatedMap,
+) -> (Scratch, Scratch) {
+    let (inputs, outputs) = (x.channels, dy.channels);
     let (tall, wide) = (padded(isa, inputs), padded(isa, outputs));
     let chunk = (CHUNK_VALUES / (IN * IN * (tall + wide)))
         .next_multiple_of(TASK_TILES)
-        .max(TASK_TILES);
-    let chunk = chunk.min(tiles.count().next_multiple_of(TASK_TILES));
+        .max(TASK_TILES)
+        .min(tiles.count().next_multiple_of(TASK_TILES));
     let (v_step, z_step) = (place_step(chunk * tall + 32), place_step(chunk * wide));
     let mut v = Scratch::take(IN * IN * v_step);
     let mut z = Scratch::take(IN * IN * z_step);
     let rows = padded_rows(inputs);
     let u_step = place_step(rows * wide);
     let mut u = Scratch::zeroed(IN * IN * u_step);
-    let tasks = tiles.count().div_ceil(TASK_TILES);
-    let mut sums = Scratch::take(tasks * wide);
+    let mut sums = Scratch::take(tiles.count().div_ceil(TASK_TILES) * wide);
     let (v, z, u_shared, sums_shared) = (
         Shared::new(&mut v),
         Shared::new(&mut z),
@@ -225,6 +253,7 @@ pub(crate) fn gradient<const IN: usize>(
     );
     // Gradient rows per task: whole row blocks, so that no two tasks write the same row.
     let row_task = if rows >= 96 { 48 } else { rows };
+    let row_tasks = rows.div_ceil(row_task);
     for first in (0..tiles.count()).step_by(chunk) {
         let count = chunk.min(tiles.count() - first);
         (0..count.div_ceil(TASK_TILES))
@@ -232,7 +261,7 @@ pub(crate) fn gradient<const IN: usize>(
             .for_each(|task| {
                 let index = task * TASK_TILES;
                 let leaf = TransformTiles::<IN> {
-                    x: source,
+                    x,
                     dy,
                     tiles,
                     range: first + index..first + (index + TASK_TILES).min(count),
@@ -245,7 +274,6 @@ pub(crate) fn gradient<const IN: usize>(
                 // task.
                 unsafe { run(isa, leaf) }
             });
-        let row_tasks = rows.div_ceil(row_task);
         (0..IN * IN * row_tasks).into_par_iter().for_each(|task| {
             let (place, row) = (task / row_tasks, task % row_tasks * row_task);
             let leaf = Accumulate {
@@ -264,23 +292,5 @@ pub(crate) fn gradient<const IN: usize>(
             unsafe { run(isa, leaf) }
         });
     }
-    for (o, dbias) in dbias.iter_mut().enumerate() {
-        let sum: f64 = sums[o..].iter().step_by(wide).map(|x| f64::from(*x)).sum();
-        *dbias = sum as f32;
-    }
-    let axes = Axes::new(outputs, inputs, false);
-    let target = Shared::new(dweight);
-    let step = (8192 / outputs).max(1);
-    (0..inputs.div_ceil(step)).into_par_iter().for_each(|task| {
-        let leaf = Unpack::<IN> {
-            gradient: &u,
-            place_step: u_step,
-            row_step: wide,
-            axes,
-            rows: task * step..((task + 1) * step).min(inputs),
-            target,
-        };
-        // SAFETY: tasks write the weights of different inputs.
-        unsafe { run(isa, leaf) }
-    });
+    (u, sums)
 }

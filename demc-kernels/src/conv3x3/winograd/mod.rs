@@ -52,7 +52,13 @@ impl<const IN: usize> Leaf for TileBlock<'_, IN> {
             range,
             y,
         } = self;
-        let (depth, columns, out) = (weights.depth, weights.columns, IN - 2);
+        let (depth, columns) = (weights.depth, weights.columns);
+        let target = OutputTiles {
+            tiles,
+            columns,
+            epilogue,
+            y,
+        };
         let (count, rows) = (range.len(), padded_rows(range.len()));
         let space = |scratch: &mut Scratch, channels: usize| TransformedTiles {
             start: scratch.as_mut_ptr(),
@@ -81,47 +87,75 @@ impl<const IN: usize> Leaf for TileBlock<'_, IN> {
                 product::<S>(count, depth, columns, a, b, c, wide, false);
             }
             for (index, tile) in range.enumerate() {
-                let (image, row, column) = tiles.at(tile);
-                let whole = row + out <= tiles.grid.height && column + out <= tiles.grid.width;
-                let line = tiles.grid.width * columns;
-                let target = y
-                    .pointer()
-                    .add((image + row * tiles.grid.width + column) * columns);
                 for channel in (0..columns).step_by(S::LANES) {
-                    let n = S::LANES.min(columns - channel);
-                    let bias = epilogue.bias::<S>(channel, n);
-                    let mut result = both!(
+                    let sums = both!(
                         line::output::<S, IN>,
                         S,
                         IN,
                         m.load::<S, IN>(index, channel)
                     );
-                    each!(r < out, {
-                        each!(c < out, {
-                            let value = S::add(result[r][c], bias);
-                            result[r][c] = if epilogue.relu { S::relu(value) } else { value };
-                        });
-                    });
-                    let target = target.add(channel);
-                    if whole && n == S::LANES {
-                        each!(r < out, {
-                            each!(c < out, {
-                                S::store(target.add(r * line + c * columns), result[r][c]);
-                            });
-                        });
+                    target.store::<S, IN>(tile, channel, sums);
+                }
+            }
+        }
+    }
+}
+
+/// The output map, written tile by tile.
+struct OutputTiles<'a> {
+    tiles: WinogradTiles,
+    columns: usize,
+    epilogue: BiasRelu<'a>,
+    y: Shared,
+}
+
+impl OutputTiles<'_> {
+    /// Writes some channels of a tile, from `channel` on, after bias and ReLU. The first `IN - 2` rows
+    /// and columns of `sums` count, as far as they lie in the image.
+    ///
+    /// # Safety
+    /// No other thread writes this tile; the processor has `S`.
+    #[inline(always)]
+    unsafe fn store<S: Simd, const IN: usize>(
+        &self,
+        tile: usize,
+        channel: usize,
+        sums: [[S::V; IN]; IN],
+    ) {
+        let (grid, columns, out) = (self.tiles.grid, self.columns, IN - 2);
+        let (image, row, column) = self.tiles.at(tile);
+        let whole = row + out <= grid.height && column + out <= grid.width;
+        let line = grid.width * columns;
+        let n = S::LANES.min(columns - channel);
+        let mut result = sums;
+        // SAFETY: pixels of the tile within the image, `n` channels of each.
+        unsafe {
+            let target = self
+                .y
+                .pointer()
+                .add((image + row * grid.width + column) * columns + channel);
+            let bias = self.epilogue.bias::<S>(channel, n);
+            each!(r < out, {
+                each!(c < out, {
+                    let value = S::add(result[r][c], bias);
+                    result[r][c] = if self.epilogue.relu {
+                        S::relu(value)
                     } else {
-                        for (r, result) in result[..out.min(tiles.grid.height - row)]
-                            .iter()
-                            .enumerate()
-                        {
-                            for (c, value) in result[..out.min(tiles.grid.width - column)]
-                                .iter()
-                                .enumerate()
-                            {
-                                S::store_part(target.add(r * line + c * columns), n, *value);
-                            }
-                        }
-                    }
+                        value
+                    };
+                });
+            });
+            if whole && n == S::LANES {
+                each!(r < out, {
+                    each!(c < out, {
+                        S::store(target.add(r * line + c * columns), result[r][c]);
+                    });
+                });
+                return;
+            }
+            for (r, result) in result[..out.min(grid.height - row)].iter().enumerate() {
+                for (c, value) in result[..out.min(grid.width - column)].iter().enumerate() {
+                    S::store_part(target.add(r * line + c * columns), n, *value);
                 }
             }
         }
