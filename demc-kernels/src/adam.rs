@@ -21,23 +21,30 @@ pub struct Adam {
     pub epsilon: f32,
 }
 
-/// Updates one weight tensor and its moments by one step. `step` counts from 1; the moments `first`
-/// and `second` are 0 before step 1.
+/// A weight tensor and its moments, which are 0 before step 1. All have one length.
+#[derive(Debug)]
+pub struct AdamWeight<'a> {
+    /// Weight.
+    pub weight: &'a mut [f32],
+    /// First moment.
+    pub first: &'a mut [f32],
+    /// Second moment.
+    pub second: &'a mut [f32],
+}
+
+/// Updates one weight tensor and its moments by one step. `step` counts from 1.
 ///
 /// # Shapes
-/// All four slices have the length of the weight.
+/// `grad` has the length of the weight.
 ///
 /// # Panics
 /// If the lengths differ, or at step 0.
-pub fn step(
-    isa: Isa,
-    rule: &Adam,
-    step: u64,
-    weight: &mut [f32],
-    grad: &[f32],
-    first: &mut [f32],
-    second: &mut [f32],
-) {
+pub fn step(isa: Isa, rule: &Adam, step: u64, weight: AdamWeight, grad: &[f32]) {
+    let AdamWeight {
+        weight,
+        first,
+        second,
+    } = weight;
     let lengths = [grad.len(), first.len(), second.len()];
     assert_eq!(
         lengths,
@@ -135,10 +142,12 @@ mod tests {
                 isa,
                 &RULE,
                 t,
-                &mut weight,
+                AdamWeight {
+                    weight: &mut weight,
+                    first: &mut first,
+                    second: &mut second,
+                },
                 &pattern(size, 1 + t as u32),
-                &mut first,
-                &mut second,
             );
         }
         [weight, first, second]
@@ -226,10 +235,12 @@ mod tests {
                 isa,
                 &RULE,
                 1,
-                &mut weight,
+                AdamWeight {
+                    weight: &mut weight,
+                    first: &mut [0.0; 3],
+                    second: &mut [0.0; 3],
+                },
                 &[0.0, f32::NAN, 1.0],
-                &mut [0.0; 3],
-                &mut [0.0; 3],
             );
             assert!(weight[0] == 1.0 && weight[1].is_nan() && weight[2].is_finite());
         }
@@ -242,10 +253,12 @@ mod tests {
             Isa::Portable,
             &RULE,
             1,
-            &mut [0.0; 2],
+            AdamWeight {
+                weight: &mut [0.0; 2],
+                first: &mut [0.0; 2],
+                second: &mut [0.0; 2],
+            },
             &[0.0; 3],
-            &mut [0.0; 2],
-            &mut [0.0; 2],
         );
     }
 }

@@ -21,6 +21,7 @@ pub mod filter5x5;
 pub mod grid;
 pub mod isa;
 pub mod memory;
+mod operands;
 pub mod pool;
 pub mod power;
 mod product;
@@ -36,4 +37,5 @@ mod testing;
 
 pub use grid::Grid;
 pub use isa::Isa;
+pub use operands::{Convolution, GradientSource, GradientTarget};
 pub use tasks::{start_threads, within_pool};

@@ -7,14 +7,24 @@ use crate::power::power;
 use crate::simd::{self, Leaf, Simd};
 use crate::tasks::{self, TASK};
 
+/// The constants of the loss.
+#[derive(Clone, Copy, Debug)]
+pub struct RelMse {
+    /// Pixels of the batch.
+    pub pixels: usize,
+    /// Exponent of the output, from 1 to 6.
+    pub gamma: f32,
+    /// Added to the squared reference.
+    pub epsilon: f32,
+}
+
 /// `1 / pixels * sum (out_gamma^gamma - ref_hdr)^2 / (ref_hdr^2 + epsilon)` over all values (Eq.
 /// 5). Writes the gradient with respect to `out_gamma` to `dout`; it is 0 where `out_gamma` is 0.
 ///
 /// Negative, NaN and infinite outputs make the loss and their gradient non-finite.
 ///
 /// # Shapes
-/// `out_gamma`, `ref_hdr` and `dout` have the same shape, in any layout. `pixels` is the number of
-/// pixels of the batch.
+/// `out_gamma`, `ref_hdr` and `dout` have the same shape, in any layout.
 ///
 /// # Panics
 /// If the lengths differ, or gamma is below 1 (an infinite gradient at 0) or above 6.
@@ -22,11 +32,14 @@ pub fn loss(
     isa: Isa,
     out_gamma: &[f32],
     ref_hdr: &[f32],
-    pixels: usize,
-    gamma: f32,
-    epsilon: f32,
+    scale: RelMse,
     dout: Option<&mut [f32]>,
 ) -> f64 {
+    let RelMse {
+        pixels,
+        gamma,
+        epsilon,
+    } = scale;
     assert_eq!(
         out_gamma.len(),
         ref_hdr.len(),
@@ -192,6 +205,14 @@ mod tests {
         (sum, gradient)
     }
 
+    fn scale(pixels: usize, gamma: f32, epsilon: f32) -> RelMse {
+        RelMse {
+            pixels,
+            gamma,
+            epsilon,
+        }
+    }
+
     #[test]
     fn power_at_the_ends() {
         for exponent in [0.5, 1.2] {
@@ -217,9 +238,7 @@ mod tests {
                         isa,
                         &out,
                         &reference,
-                        size / 3,
-                        gamma,
-                        1e-3,
+                        scale(size / 3, gamma, 1e-3),
                         Some(&mut dout),
                     );
                     assert!(
@@ -227,7 +246,7 @@ mod tests {
                         "{isa} {size}: {found}, not {sum}"
                     );
                     assert_within(&format!("{isa}, {size} values"), &dout, &gradient, 1e-7);
-                    let alone = loss(isa, &out, &reference, size / 3, gamma, 1e-3, None);
+                    let alone = loss(isa, &out, &reference, scale(size / 3, gamma, 1e-3), None);
                     assert_eq!(alone.to_bits(), found.to_bits());
                 }
             }
@@ -238,7 +257,13 @@ mod tests {
     fn black_output_has_no_gradient_and_the_loss_of_its_reference() {
         for isa in Isa::available() {
             let mut dout = [f32::NAN; 3];
-            let found = loss(isa, &[0.0; 3], &[1.0; 3], 1, 2.2, 0.0, Some(&mut dout));
+            let found = loss(
+                isa,
+                &[0.0; 3],
+                &[1.0; 3],
+                scale(1, 2.2, 0.0),
+                Some(&mut dout),
+            );
             assert_eq!((found, dout), (3.0, [0.0; 3]));
         }
     }
@@ -255,14 +280,14 @@ mod tests {
                 let (mut out, mut reference) = images(40);
                 out[offset] = bad;
                 let mut dout = vec![0.0; 40];
-                let found = loss(isa, &out, &reference, 13, 2.2, 1e-3, Some(&mut dout));
+                let found = loss(isa, &out, &reference, scale(13, 2.2, 1e-3), Some(&mut dout));
                 assert!(
                     !found.is_finite() && !dout[offset].is_finite(),
                     "{isa}: {bad}"
                 );
                 assert!(dout.iter().filter(|d| !d.is_finite()).count() == 1);
                 (out[offset], reference[offset]) = (1.0, if bad == -1.0 { f32::NAN } else { bad });
-                assert!(!loss(isa, &out, &reference, 13, 2.2, 1e-3, None).is_finite());
+                assert!(!loss(isa, &out, &reference, scale(13, 2.2, 1e-3), None).is_finite());
             }
         }
     }
@@ -275,7 +300,13 @@ mod tests {
         let (out, reference) = images(size);
         let work = |isa| {
             let mut dout = vec![0.0; size];
-            let sum = loss(isa, &out, &reference, size / 3, 2.2, 1e-3, Some(&mut dout));
+            let sum = loss(
+                isa,
+                &out,
+                &reference,
+                scale(size / 3, 2.2, 1e-3),
+                Some(&mut dout),
+            );
             (sum.to_bits(), bits(&dout))
         };
         for isa in Isa::available() {

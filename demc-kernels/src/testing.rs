@@ -101,7 +101,12 @@ macro_rules! assert_equals_reference {
         let (x, weight, dy, bias) = ($x, $weight, $dy, pattern($outputs, 3));
         for relu in [false, true] {
             let mut y = vec![f32::NAN; dy.len()];
-            forward($isa, $grid, &x, &weight, &bias, relu, &mut y);
+            let convolution = $crate::Convolution {
+                weight: &weight,
+                bias: &bias,
+                relu,
+            };
+            forward($isa, $grid, &x, convolution, &mut y);
             let expected =
                 reference::$forward($grid, &f64s(&x), &f64s(&weight), &f64s(&bias), relu);
             assert_close(&format!("{} y", $name), &y, &expected);
@@ -114,8 +119,17 @@ macro_rules! assert_equals_reference {
             let expected = reference::$backward($grid, &f64s(&x), &f64s(&weight), &gated);
             let (mut dx, mut dweight) = (vec![f32::NAN; x.len()], vec![f32::NAN; weight.len()]);
             let mut dbias = vec![f32::NAN; $outputs];
-            let (dx_out, dw, db) = (Some(&mut dx[..]), &mut dweight, &mut dbias);
-            backward($isa, $grid, &x, &weight, gate, &dy, dx_out, dw, db);
+            let source = $crate::GradientSource {
+                weight: &weight,
+                y: gate,
+                dy: &dy,
+            };
+            let target = $crate::GradientTarget {
+                dx: Some(&mut dx[..]),
+                dweight: &mut dweight,
+                dbias: &mut dbias,
+            };
+            backward($isa, $grid, &x, source, target);
             assert_close(&format!("{} dx", $name), &dx, &expected.dx);
             assert_close(&format!("{} dweight", $name), &dweight, &expected.dweight);
             assert_close(&format!("{} dbias", $name), &dbias, &expected.dbias);

@@ -18,6 +18,9 @@
 mod peak;
 
 use demc_bench::stopwatch::{Spread, interleaved};
+use demc_kernels::batch_norm::{BatchNorm, BatchNormSource, Moments};
+use demc_kernels::rel_mse::RelMse;
+use demc_kernels::{Convolution, GradientSource, GradientTarget};
 use demc_kernels::{Grid, Isa, adam, batch_norm, conv1x1, conv3x3, deconv4x4, grid, pool, rel_mse};
 use peak::Peak;
 use rand::{RngExt, SeedableRng};
@@ -151,7 +154,7 @@ impl Bench {
             self.run(
                 &format!("conv3x3 forward {size}"),
                 Work::Flops(flops),
-                |isa| conv3x3::forward(isa, grid, &x, &weight, &bias, true, &mut y),
+                |isa| conv3x3::forward(isa, grid, &x, rectified(&weight, &bias), &mut y),
             );
             let dy = draw(pixels * outputs);
             let (mut dx, mut dw, mut db) = (x.clone(), weight.clone(), bias.clone());
@@ -159,8 +162,8 @@ impl Bench {
                 &format!("conv3x3 backward {size}"),
                 Work::Flops(2.0 * flops),
                 |isa| {
-                    let (dx, y) = (Some(&mut dx[..]), Some(&y[..]));
-                    conv3x3::backward(isa, grid, &x, &weight, y, &dy, dx, &mut dw, &mut db);
+                    let target = target(Some(&mut dx[..]), &mut dw, &mut db);
+                    conv3x3::backward(isa, grid, &x, source(&weight, &y, &dy), target);
                 },
             );
         }
@@ -179,7 +182,7 @@ impl Bench {
             self.run(
                 &format!("conv1x1 forward {size}"),
                 Work::Flops(flops),
-                |isa| conv1x1::forward(isa, grid, &xs, &weight, &bias, true, &mut y),
+                |isa| conv1x1::forward(isa, grid, &xs, rectified(&weight, &bias), &mut y),
             );
             let dy = draw(pixels * k);
             let [mut a, mut b, mut c] = inputs.clone();
@@ -189,8 +192,8 @@ impl Bench {
                 Work::Flops(2.0 * flops),
                 |isa| {
                     let mut dxs = [Some(&mut a[..]), Some(&mut b[..]), Some(&mut c[..])];
-                    let y = Some(&y[..]);
-                    conv1x1::backward(isa, grid, &xs, &weight, y, &dy, &mut dxs, &mut dw, &mut db);
+                    let target = target(&mut dxs[..], &mut dw, &mut db);
+                    conv1x1::backward(isa, grid, &xs, source(&weight, &y, &dy), target);
                 },
             );
         }
@@ -212,7 +215,7 @@ impl Bench {
             self.run(
                 &format!("deconv4x4 forward {size}"),
                 Work::Flops(flops),
-                |isa| deconv4x4::forward(isa, grid, &x, &weight, &bias, true, &mut y),
+                |isa| deconv4x4::forward(isa, grid, &x, rectified(&weight, &bias), &mut y),
             );
             let dy = draw(large * outputs);
             let (mut dx, mut dw, mut db) = (x.clone(), weight.clone(), bias.clone());
@@ -220,8 +223,8 @@ impl Bench {
                 &format!("deconv4x4 backward {size}"),
                 Work::Flops(2.0 * flops),
                 |isa| {
-                    let (dx, y) = (Some(&mut dx[..]), Some(&y[..]));
-                    deconv4x4::backward(isa, grid, &x, &weight, y, &dy, dx, &mut dw, &mut db);
+                    let target = target(Some(&mut dx[..]), &mut dw, &mut db);
+                    deconv4x4::backward(isa, grid, &x, source(&weight, &y, &dy), target);
                 },
             );
         }
@@ -258,13 +261,17 @@ impl Bench {
                 batch_norm::forward_train(
                     isa,
                     &x,
-                    &gamma,
-                    &beta,
-                    EPSILON,
-                    true,
+                    BatchNorm {
+                        gamma: &gamma,
+                        beta: &beta,
+                        epsilon: EPSILON,
+                        relu: true,
+                    },
                     &mut y,
-                    &mut mean,
-                    &mut variance,
+                    Moments {
+                        mean: &mut mean,
+                        variance: &mut variance,
+                    },
                 );
             },
         );
@@ -274,19 +281,18 @@ impl Bench {
             &format!("batch norm backward {c} at full size"),
             bytes(7 * values),
             |isa| {
-                batch_norm::backward(
-                    isa,
-                    &x,
-                    &gamma,
-                    &mean,
-                    &variance,
-                    EPSILON,
-                    Some(&y),
-                    &dy,
-                    &mut dx,
-                    &mut dgamma,
-                    &mut dbeta,
-                );
+                let source = BatchNormSource {
+                    x: &x,
+                    gamma: &gamma,
+                    moments: Moments {
+                        mean: &mean,
+                        variance: &variance,
+                    },
+                    epsilon: EPSILON,
+                    y: Some(&y),
+                    dy: &dy,
+                };
+                batch_norm::backward(isa, source, &mut dx, &mut dgamma, &mut dbeta);
             },
         );
     }
@@ -296,8 +302,12 @@ impl Bench {
         let (out, reference) = (draw(3 * pixels), draw(3 * pixels));
         let mut dout = out.clone();
         self.run("rel_mse with gradient", bytes(9 * pixels), |isa| {
-            let dout = Some(&mut dout[..]);
-            rel_mse::loss(isa, &out, &reference, pixels, 2.2, EPSILON, dout);
+            let scale = RelMse {
+                pixels,
+                gamma: 2.2,
+                epsilon: EPSILON,
+            };
+            rel_mse::loss(isa, &out, &reference, scale, Some(&mut dout[..]));
         });
     }
 
@@ -317,7 +327,12 @@ impl Bench {
             &format!("adam step of {values} weights"),
             bytes(7 * values),
             |isa| {
-                adam::step(isa, &rule, 1, &mut weight, &grad, &mut first, &mut second);
+                let weight = adam::AdamWeight {
+                    weight: &mut weight,
+                    first: &mut first,
+                    second: &mut second,
+                };
+                adam::step(isa, &rule, 1, weight, &grad);
             },
         );
     }
@@ -353,4 +368,24 @@ fn draw(len: usize) -> Vec<f32> {
 
 fn bytes(values: usize) -> Work {
     Work::Bytes(4.0 * values as f64)
+}
+
+fn rectified<'a>(weight: &'a [f32], bias: &'a [f32]) -> Convolution<'a> {
+    Convolution {
+        weight,
+        bias,
+        relu: true,
+    }
+}
+
+fn source<'a>(weight: &'a [f32], y: &'a [f32], dy: &'a [f32]) -> GradientSource<'a> {
+    GradientSource {
+        weight,
+        y: Some(y),
+        dy,
+    }
+}
+
+fn target<'a, X>(dx: X, dweight: &'a mut [f32], dbias: &'a mut [f32]) -> GradientTarget<'a, X> {
+    GradientTarget { dx, dweight, dbias }
 }

@@ -22,62 +22,76 @@ const ROW: usize = 512;
 /// second pass.
 const BLOCK: usize = 2 * TASK;
 
-/// Normalises by the statistics of the batch: `y = (x - mean) / sqrt(variance + epsilon) * gamma +
-/// beta`, rectified if `relu`. Writes the mean and the biased variance of each channel over all
-/// pixels.
+/// A batch normalisation and the ReLU after it.
 ///
 /// # Shapes
-/// `x` and `y`: `[pixels, channels]`; the others `[channels]`.
+/// `[channels]`.
+#[derive(Clone, Copy, Debug)]
+pub struct BatchNorm<'a> {
+    /// Scale.
+    pub gamma: &'a [f32],
+    /// Shift.
+    pub beta: &'a [f32],
+    /// Added to the variance.
+    pub epsilon: f32,
+    /// Whether the output is rectified.
+    pub relu: bool,
+}
+
+/// Mean and biased variance over all pixels.
+///
+/// # Shapes
+/// `[channels]`.
+#[derive(Clone, Copy, Debug)]
+pub struct Moments<T> {
+    /// Mean.
+    pub mean: T,
+    /// Biased variance.
+    pub variance: T,
+}
+
+/// Normalises by the statistics of the batch: `y = (x - mean) / sqrt(variance + epsilon) * gamma +
+/// beta`, rectified if `norm.relu`. Writes the statistics to `moments`.
+///
+/// # Shapes
+/// `x` and `y`: `[pixels, channels]`.
 ///
 /// # Panics
 /// If a length does not match the others, or a map has no pixels.
-#[allow(
-    clippy::too_many_arguments,
-    reason = "the operands of a batch normalisation"
-)]
 pub fn forward_train(
     isa: Isa,
     x: &[f32],
-    gamma: &[f32],
-    beta: &[f32],
-    epsilon: f32,
-    relu: bool,
+    norm: BatchNorm,
     y: &mut [f32],
-    mean: &mut [f32],
-    variance: &mut [f32],
+    moments: Moments<&mut [f32]>,
 ) {
+    let BatchNorm { gamma, beta, .. } = norm;
+    let Moments { mean, variance } = moments;
     check(
         x.len(),
         gamma.len(),
         &[beta.len(), mean.len(), variance.len()],
     );
     statistics(isa, x, mean, variance);
-    forward_eval(isa, x, gamma, beta, mean, variance, epsilon, relu, y);
+    forward_eval(isa, x, norm, Moments { mean, variance }, y);
 }
 
 /// Normalises by given statistics: `y = (x - mean) / sqrt(variance + epsilon) * gamma + beta`,
-/// rectified if `relu`.
+/// rectified if `norm.relu`.
 ///
 /// # Shapes
-/// `x` and `y`: `[pixels, channels]`; the others `[channels]`.
+/// `x` and `y`: `[pixels, channels]`.
 ///
 /// # Panics
 /// If a length does not match the others, or a map has no pixels.
-#[allow(
-    clippy::too_many_arguments,
-    reason = "the operands of a batch normalisation"
-)]
-pub fn forward_eval(
-    isa: Isa,
-    x: &[f32],
-    gamma: &[f32],
-    beta: &[f32],
-    mean: &[f32],
-    variance: &[f32],
-    epsilon: f32,
-    relu: bool,
-    y: &mut [f32],
-) {
+pub fn forward_eval(isa: Isa, x: &[f32], norm: BatchNorm, moments: Moments<&[f32]>, y: &mut [f32]) {
+    let BatchNorm {
+        gamma,
+        beta,
+        epsilon,
+        relu,
+    } = norm;
+    let Moments { mean, variance } = moments;
     let channels = gamma.len();
     check(x.len(), channels, &[beta.len(), mean.len(), variance.len()]);
     assert_eq!(x.len(), y.len(), "maps of one size");
@@ -100,32 +114,49 @@ pub fn forward_eval(
     });
 }
 
-/// Gradients of [`forward_train`], including the dependence of its statistics on `x`. If the output
-/// was rectified, `y` is that output, and `dy` counts only where `y` is positive. All three
-/// gradients are overwritten.
+/// What the gradients of [`forward_train`] are computed from.
 ///
 /// # Shapes
-/// `x`, `y`, `dy` and `dx`: `[pixels, channels]`; the others `[channels]`.
+/// `x`, `y`, and `dy`: `[pixels, channels]`; the others `[channels]`.
+#[derive(Clone, Copy, Debug)]
+pub struct BatchNormSource<'a> {
+    /// Input.
+    pub x: &'a [f32],
+    /// Scale.
+    pub gamma: &'a [f32],
+    /// Statistics of `x`.
+    pub moments: Moments<&'a [f32]>,
+    /// Added to the variance.
+    pub epsilon: f32,
+    /// The output, if it was rectified: `dy` counts only where it is positive.
+    pub y: Option<&'a [f32]>,
+    /// Gradient with respect to the output.
+    pub dy: &'a [f32],
+}
+
+/// Gradients of [`forward_train`], including the dependence of its statistics on `x`. All three are
+/// overwritten.
+///
+/// # Shapes
+/// `dx`: `[pixels, channels]`; `dgamma` and `dbeta`: `[channels]`.
 ///
 /// # Panics
 /// If a length does not match the others, or a map has no pixels.
-#[allow(
-    clippy::too_many_arguments,
-    reason = "the operands of a batch normalisation"
-)]
 pub fn backward(
     isa: Isa,
-    x: &[f32],
-    gamma: &[f32],
-    mean: &[f32],
-    variance: &[f32],
-    epsilon: f32,
-    y: Option<&[f32]>,
-    dy: &[f32],
+    source: BatchNormSource,
     dx: &mut [f32],
     dgamma: &mut [f32],
     dbeta: &mut [f32],
 ) {
+    let BatchNormSource {
+        x,
+        gamma,
+        moments: Moments { mean, variance },
+        epsilon,
+        y,
+        dy,
+    } = source;
     let channels = gamma.len();
     check(
         x.len(),

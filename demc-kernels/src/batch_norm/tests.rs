@@ -64,29 +64,32 @@ fn found(isa: Isa, case: &Case, relu: bool) -> KernelResult {
     forward_train(
         isa,
         &case.x,
-        &case.gamma,
-        &case.beta,
-        EPSILON,
-        relu,
+        BatchNorm {
+            gamma: &case.gamma,
+            beta: &case.beta,
+            epsilon: EPSILON,
+            relu,
+        },
         &mut y,
-        &mut mean,
-        &mut variance,
+        Moments {
+            mean: &mut mean,
+            variance: &mut variance,
+        },
     );
     let (mut dx, mut dgamma, mut dbeta) = (map(), row(), row());
     let gate = relu.then_some(&y[..]);
-    backward(
-        isa,
-        &case.x,
-        &case.gamma,
-        &mean,
-        &variance,
-        EPSILON,
-        gate,
-        &case.dy,
-        &mut dx,
-        &mut dgamma,
-        &mut dbeta,
-    );
+    let source = BatchNormSource {
+        x: &case.x,
+        gamma: &case.gamma,
+        moments: Moments {
+            mean: &mean,
+            variance: &variance,
+        },
+        epsilon: EPSILON,
+        y: gate,
+        dy: &case.dy,
+    };
+    backward(isa, source, &mut dx, &mut dgamma, &mut dbeta);
     KernelResult {
         y,
         mean,
@@ -194,13 +197,17 @@ fn a_constant_map_becomes_beta() {
         forward_train(
             isa,
             &[0.3; 99],
-            &[2.0; 3],
-            &beta,
-            EPSILON,
-            false,
+            BatchNorm {
+                gamma: &[2.0; 3],
+                beta: &beta,
+                epsilon: EPSILON,
+                relu: false,
+            },
             &mut y,
-            &mut mean,
-            &mut variance,
+            Moments {
+                mean: &mut mean,
+                variance: &mut variance,
+            },
         );
         assert_eq!((mean, variance), ([0.3; 3], [0.0; 3]));
         assert!(y.iter().enumerate().all(|(i, y)| *y == beta[i % 3]));
@@ -238,9 +245,17 @@ fn non_finite_values_pass_through_the_relu() {
         );
         let mut y = [0.0; 3];
         let x = [f32::INFINITY, f32::NAN, -1.0];
-        forward_eval(
-            isa, &x, &[1.0; 3], &[0.0; 3], &[0.0; 3], &[1.0; 3], 0.0, true, &mut y,
-        );
+        let norm = BatchNorm {
+            gamma: &[1.0; 3],
+            beta: &[0.0; 3],
+            epsilon: 0.0,
+            relu: true,
+        };
+        let moments = Moments {
+            mean: &[0.0; 3][..],
+            variance: &[1.0; 3],
+        };
+        forward_eval(isa, &x, norm, moments, &mut y);
         assert!(
             y[0] == f32::INFINITY && y[1].is_nan() && y[2] == 0.0,
             "{isa}: {y:?}"
@@ -251,15 +266,15 @@ fn non_finite_values_pass_through_the_relu() {
 #[test]
 #[should_panic(expected = "10 values are no map of 3 channels")]
 fn lengths_are_checked() {
-    forward_eval(
-        Isa::Portable,
-        &[0.0; 10],
-        &[0.0; 3],
-        &[0.0; 3],
-        &[0.0; 3],
-        &[0.0; 3],
-        0.0,
-        true,
-        &mut [0.0; 10],
-    );
+    let norm = BatchNorm {
+        gamma: &[0.0; 3],
+        beta: &[0.0; 3],
+        epsilon: 0.0,
+        relu: true,
+    };
+    let moments = Moments {
+        mean: &[0.0; 3][..],
+        variance: &[0.0; 3],
+    };
+    forward_eval(Isa::Portable, &[0.0; 10], norm, moments, &mut [0.0; 10]);
 }

@@ -6,25 +6,17 @@ use rayon::prelude::*;
 use crate::product::padded_rows;
 use crate::rows::{self, BLOCK, Copy, Outer, Packed, PaddedRows, Term, copy, whole};
 use crate::scratch::Scratch;
-use crate::{Grid, Isa};
+use crate::{Convolution, GradientSource, GradientTarget, Grid, Isa};
 
-/// `y = [xs] * weight + bias`, rectified if `relu`.
+/// `y = [xs] * weight + bias`, rectified if `convolution.relu`.
 ///
 /// # Shapes
-/// `xs` `[B, H, W, in_i]` each, `weight` `[out, in]` with `in` the sum of all, `bias` `[out]`, `y`
-/// `[B, H, W, out]`.
+/// `xs` `[B, H, W, in_i]` each, `weight` `[out, in]` with `in` the sum of all, `y` `[B, H, W, out]`.
 ///
 /// # Panics
 /// If a length does not match the others.
-pub fn forward(
-    isa: Isa,
-    grid: Grid,
-    xs: &[&[f32]],
-    weight: &[f32],
-    bias: &[f32],
-    relu: bool,
-    y: &mut [f32],
-) {
+pub fn forward(isa: Isa, grid: Grid, xs: &[&[f32]], convolution: Convolution, y: &mut [f32]) {
+    let Convolution { weight, bias, relu } = convolution;
     let (inputs, outputs) = (
         check(grid, xs, weight.len(), bias.len(), y.len()),
         bias.len(),
@@ -51,7 +43,7 @@ pub fn forward(
     );
 }
 
-/// Operations on the sum of [`part`].
+/// Operations on the sum of [`add_part`].
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Epilogue<'a> {
     /// Added to each channel.
@@ -62,6 +54,17 @@ pub struct Epilogue<'a> {
     pub add: bool,
 }
 
+/// A part of a 1x1 convolution, for [`add_part`].
+#[derive(Clone, Copy, Debug)]
+pub struct Part<'a> {
+    /// Weight of the whole convolution, `[out, in]`.
+    pub weight: &'a [f32],
+    /// The first of the part's inputs.
+    pub first: usize,
+    /// Operations on the sum.
+    pub epilogue: Epilogue<'a>,
+}
+
 /// A part of a 1x1 convolution, for inference: `y = epilogue([xs] * W + y)`. W holds the inputs of
 /// `weight` from `first` on.
 ///
@@ -69,20 +72,16 @@ pub struct Epilogue<'a> {
 /// in memory together.
 ///
 /// # Shapes
-/// `xs` `[B, H, W, in_i]` each, `weight` `[out, in]` with `first` and the sum of all `in_i` at most
-/// `in`, `y` `[B, H, W, out]`.
+/// `xs` `[B, H, W, in_i]` each, `first` and the sum of all `in_i` at most `in`, `y` `[B, H, W, out]`.
 ///
 /// # Panics
 /// If a length does not match the others.
-pub fn part(
-    isa: Isa,
-    grid: Grid,
-    xs: &[&[f32]],
-    weight: &[f32],
-    first: usize,
-    epilogue: Epilogue,
-    y: &mut [f32],
-) {
+pub fn add_part(isa: Isa, grid: Grid, xs: &[&[f32]], part: Part, y: &mut [f32]) {
+    let Part {
+        weight,
+        first,
+        epilogue,
+    } = part;
     let outputs = grid.channels(y.len());
     let isa = isa.for_channels(outputs);
     let total = weight.len() / outputs;
@@ -141,28 +140,23 @@ fn products(
         });
 }
 
-/// Gradients of [`forward`]. `dy` is the gradient with respect to `y`. Writes the requested
-/// gradients of `xs`, `dweight` and `dbias`.
-///
-/// If the output was rectified, `y` is that output, and `dy` counts only where `y` is positive.
-///
-/// # Shapes
-/// As in [`forward`]; a gradient has the shape of its value.
+/// Gradients of [`forward`]. Overwrites `target`, and of the inputs' gradients the requested ones.
 ///
 /// # Panics
 /// If a length does not match the others.
-#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
 pub fn backward(
     isa: Isa,
     grid: Grid,
     xs: &[&[f32]],
-    weight: &[f32],
-    y: Option<&[f32]>,
-    dy: &[f32],
-    dxs: &mut [Option<&mut [f32]>],
-    dweight: &mut [f32],
-    dbias: &mut [f32],
+    source: GradientSource,
+    target: GradientTarget<&mut [Option<&mut [f32]>]>,
 ) {
+    let GradientSource { weight, y, dy } = source;
+    let GradientTarget {
+        dx: dxs,
+        dweight,
+        dbias,
+    } = target;
     let (inputs, outputs) = (
         check(grid, xs, weight.len(), dbias.len(), dy.len()),
         dbias.len(),

@@ -32,21 +32,22 @@ fn parts_added_one_by_one_are_the_whole() {
             let xs: Vec<&[f32]> = maps.iter().map(|x| &x[..]).collect();
             let (weight, bias) = (pattern(outputs * 39, 7), pattern(outputs, 8));
             let mut y = vec![f32::NAN; grid.pixels() * outputs];
-            part(
-                isa,
-                grid,
-                &xs[1..],
-                &weight,
-                20,
-                Epilogue::default(),
-                &mut y,
-            );
-            let last = Epilogue {
-                bias: Some(&bias),
-                relu: true,
-                add: true,
+            let first = Part {
+                weight: &weight,
+                first: 20,
+                epilogue: Epilogue::default(),
             };
-            part(isa, grid, &xs[..1], &weight, 0, last, &mut y);
+            add_part(isa, grid, &xs[1..], first, &mut y);
+            let last = Part {
+                weight: &weight,
+                first: 0,
+                epilogue: Epilogue {
+                    bias: Some(&bias),
+                    relu: true,
+                    add: true,
+                },
+            };
+            add_part(isa, grid, &xs[..1], last, &mut y);
             let expected = reference::conv1x1(
                 grid,
                 &concatenated(grid, &xs),
@@ -82,7 +83,12 @@ fn equals_the_reference_of_the_concatenation_on_every_path() {
                 let name = format!("{isa} {grid:?} {inputs:?} to {outputs}");
                 let cat = concatenated(grid, &xs);
                 let mut y = vec![f32::NAN; dy.len()];
-                forward(isa, grid, &xs, &weight, &bias, true, &mut y);
+                let convolution = Convolution {
+                    weight: &weight,
+                    bias: &bias,
+                    relu: true,
+                };
+                forward(isa, grid, &xs, convolution, &mut y);
                 let expected = reference::conv1x1(grid, &cat, &f64s(&weight), &f64s(&bias), true);
                 assert_close(&format!("{name} y"), &y, &expected);
 
@@ -101,12 +107,16 @@ fn equals_the_reference_of_the_concatenation_on_every_path() {
                     isa,
                     grid,
                     &xs,
-                    &weight,
-                    Some(&y),
-                    &dy,
-                    &mut slots,
-                    &mut dweight,
-                    &mut dbias,
+                    GradientSource {
+                        weight: &weight,
+                        y: Some(&y),
+                        dy: &dy,
+                    },
+                    GradientTarget {
+                        dx: &mut slots[..],
+                        dweight: &mut dweight,
+                        dbias: &mut dbias,
+                    },
                 );
                 let dxs: Vec<&[f32]> = dxs.iter().map(|x| &x[..]).collect();
                 let found: Vec<f32> = concatenated(grid, &dxs).iter().map(|x| *x as f32).collect();

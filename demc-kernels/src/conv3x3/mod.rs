@@ -8,7 +8,7 @@ mod tests;
 mod thin;
 mod winograd;
 
-use crate::{Grid, Isa};
+use crate::{Convolution, GradientSource, GradientTarget, Grid, Isa};
 use parts::{Axes, BiasRelu};
 
 /// Tiles of the Winograd transforms.
@@ -31,43 +31,17 @@ fn is_wide(inputs: usize, outputs: usize) -> bool {
     inputs.min(outputs) >= WINOGRAD_CHANNELS
 }
 
-/// `y = x * weight + bias`, rectified if `relu`.
+/// `y = x * weight + bias`, rectified if `convolution.relu`.
 ///
 /// # Shapes
-/// `x` `[B, H, W, in]`, `weight` `[out, in, 3, 3]`, `bias` `[out]`, `y` `[B, H, W, out]`.
+/// `x` `[B, H, W, in]`, `weight` `[out, in, 3, 3]`, `y` `[B, H, W, out]`.
 ///
 /// # Panics
 /// If a length does not match the others.
-#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
-pub fn forward(
-    isa: Isa,
-    grid: Grid,
-    x: &[f32],
-    weight: &[f32],
-    bias: &[f32],
-    relu: bool,
-    y: &mut [f32],
-) {
-    forward_with(isa, Tile::F2, grid, x, weight, bias, relu, y);
-}
-
-/// [`forward`] with a given tile size.
-///
-/// # Panics
-/// If a length does not match the others.
-#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
-pub fn forward_with(
-    isa: Isa,
-    tile: Tile,
-    grid: Grid,
-    x: &[f32],
-    weight: &[f32],
-    bias: &[f32],
-    relu: bool,
-    y: &mut [f32],
-) {
+pub fn forward(isa: Isa, grid: Grid, x: &[f32], convolution: Convolution, y: &mut [f32]) {
+    let Convolution { weight, bias, .. } = convolution;
     check(grid, x.len(), weight.len(), bias.len(), y.len());
-    PreparedConvolution::new(isa, tile, weight, bias, relu).forward(grid, x, 0, y);
+    PreparedConvolution::new(isa, Tile::F2, convolution).forward(grid, x, 0, y);
 }
 
 /// A convolution whose weights are prepared once, for maps that come in bands of rows.
@@ -86,11 +60,12 @@ enum PreparedWeights<'a> {
 }
 
 impl<'a> PreparedConvolution<'a> {
-    /// Prepares `weight` `[out, in, 3, 3]` and `bias` `[out]`; the output is rectified if `relu`.
+    /// Prepares a convolution with a weight `[out, in, 3, 3]`.
     ///
     /// # Panics
     /// If a length does not match the others.
-    pub fn new(isa: Isa, tile: Tile, weight: &'a [f32], bias: &'a [f32], relu: bool) -> Self {
+    pub fn new(isa: Isa, tile: Tile, convolution: Convolution<'a>) -> Self {
+        let Convolution { weight, bias, relu } = convolution;
         let outputs = bias.len();
         let inputs = weight.len() / (9 * outputs);
         assert_eq!(
@@ -181,28 +156,13 @@ impl<'a> PreparedConvolution<'a> {
     }
 }
 
-/// Gradients of [`forward`]. `dy` is the gradient with respect to `y`. Overwrites `dx` (if given),
-/// `dweight` and `dbias`.
-///
-/// If the output was rectified, `y` is that output, and `dy` counts only where `y` is positive.
-///
-/// # Shapes
-/// As in [`forward`]; a gradient has the shape of its value.
+/// Gradients of [`forward`]. Overwrites all of `target`.
 ///
 /// # Panics
 /// If a length does not match the others.
-#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
-pub fn backward(
-    isa: Isa,
-    grid: Grid,
-    x: &[f32],
-    weight: &[f32],
-    y: Option<&[f32]>,
-    dy: &[f32],
-    dx: Option<&mut [f32]>,
-    dweight: &mut [f32],
-    dbias: &mut [f32],
-) {
+pub fn backward(isa: Isa, grid: Grid, x: &[f32], source: GradientSource, target: GradientTarget) {
+    let GradientSource { weight, y, dy } = source;
+    let GradientTarget { dx, dweight, dbias } = target;
     let (inputs, outputs) = check(grid, x.len(), weight.len(), dbias.len(), dy.len());
     assert_eq!(dweight.len(), weight.len(), "a weight's gradient");
     assert!(

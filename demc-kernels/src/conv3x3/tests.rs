@@ -58,8 +58,13 @@ fn bands_of_rows_are_the_whole() {
             let bias = pattern(outputs, 3);
             for tile in [Tile::F2, Tile::F4] {
                 let mut whole = vec![f32::NAN; grid.pixels() * outputs];
-                forward_with(isa, tile, grid, &x, &weight, &bias, true, &mut whole);
-                let ready = PreparedConvolution::new(isa, tile, &weight, &bias, true);
+                let convolution = Convolution {
+                    weight: &weight,
+                    bias: &bias,
+                    relu: true,
+                };
+                let ready = PreparedConvolution::new(isa, tile, convolution);
+                ready.forward(grid, &x, 0, &mut whole);
                 let mut bands = vec![f32::NAN; whole.len()];
                 for (first, end) in [(0, 4), (4, 16), (16, 23)] {
                     let (from, target) =

@@ -19,30 +19,21 @@ use rayon::prelude::*;
 use crate::product::padded_rows;
 use crate::rows::{self, Copy, Outer, Packed, Term, copy, whole};
 use crate::scratch::{Scratch, Shared};
-use crate::{Grid, Isa};
+use crate::{Convolution, GradientSource, GradientTarget, Grid, Isa};
 use cells::{CellRun, Cells};
 use weights::{TAPS, packed};
 
-/// `y = x * weight + bias`, rectified if `relu`.
+/// `y = x * weight + bias`, rectified if `convolution.relu`.
 ///
 /// # Shapes
-/// `grid` is that of `x` `[B, H, W, in]`; `weight` `[in, out, 4, 4]`, `bias` `[out]`, `y` `[B, 2H,
-/// 2W, out]`.
+/// `grid` is that of `x` `[B, H, W, in]`; `weight` `[in, out, 4, 4]`, `y` `[B, 2H, 2W, out]`.
 ///
 /// # Panics
 /// If a length does not match the others.
-#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
-pub fn forward(
-    isa: Isa,
-    grid: Grid,
-    x: &[f32],
-    weight: &[f32],
-    bias: &[f32],
-    relu: bool,
-    y: &mut [f32],
-) {
+pub fn forward(isa: Isa, grid: Grid, x: &[f32], convolution: Convolution, y: &mut [f32]) {
+    let Convolution { weight, bias, .. } = convolution;
     check(grid, x.len(), weight.len(), bias.len(), y.len());
-    PreparedDeconvolution::new(isa, weight, bias, relu).forward(grid, x, 0, y);
+    PreparedDeconvolution::new(isa, convolution).forward(grid, x, 0, y);
 }
 
 /// A deconvolution whose weights are prepared once, for maps that come in bands of rows.
@@ -55,11 +46,12 @@ pub struct PreparedDeconvolution<'a> {
 }
 
 impl<'a> PreparedDeconvolution<'a> {
-    /// Prepares `weight` `[in, out, 4, 4]` and `bias` `[out]`; the output is rectified if `relu`.
+    /// Prepares a deconvolution with a weight `[in, out, 4, 4]`.
     ///
     /// # Panics
     /// If a length does not match the others.
-    pub fn new(isa: Isa, weight: &[f32], bias: &'a [f32], relu: bool) -> Self {
+    pub fn new(isa: Isa, convolution: Convolution<'a>) -> Self {
+        let Convolution { weight, bias, relu } = convolution;
         let outputs = bias.len();
         let inputs = weight.len() / (16 * outputs);
         assert_eq!(
@@ -226,28 +218,13 @@ impl OutputBand<'_> {
     }
 }
 
-/// Gradients of [`forward`]. `dy` is the gradient with respect to `y`. Overwrites `dx` (if given),
-/// `dweight` and `dbias`.
-///
-/// If the output was rectified, `y` is that output, and `dy` counts only where `y` is positive.
-///
-/// # Shapes
-/// As in [`forward`]; a gradient has the shape of its value.
+/// Gradients of [`forward`]. Overwrites all of `target`.
 ///
 /// # Panics
 /// If a length does not match the others.
-#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
-pub fn backward(
-    isa: Isa,
-    grid: Grid,
-    x: &[f32],
-    weight: &[f32],
-    y: Option<&[f32]>,
-    dy: &[f32],
-    dx: Option<&mut [f32]>,
-    dweight: &mut [f32],
-    dbias: &mut [f32],
-) {
+pub fn backward(isa: Isa, grid: Grid, x: &[f32], source: GradientSource, target: GradientTarget) {
+    let GradientSource { weight, y, dy } = source;
+    let GradientTarget { dx, dweight, dbias } = target;
     let (inputs, outputs) = check(grid, x.len(), weight.len(), dbias.len(), dy.len());
     assert_eq!(dweight.len(), weight.len(), "a weight's gradient");
     assert!(

@@ -19,8 +19,13 @@ fn bands_of_rows_are_the_whole() {
         );
         let bias = pattern(outputs, 3);
         let mut whole = vec![f32::NAN; grid.doubled().pixels() * outputs];
-        forward(isa, grid, &x, &weight, &bias, true, &mut whole);
-        let ready = PreparedDeconvolution::new(isa, &weight, &bias, true);
+        let convolution = Convolution {
+            weight: &weight,
+            bias: &bias,
+            relu: true,
+        };
+        forward(isa, grid, &x, convolution, &mut whole);
+        let ready = PreparedDeconvolution::new(isa, convolution);
         let mut bands = vec![f32::NAN; whole.len()];
         for (first, end) in [(0, 1), (1, 7), (7, 11)] {
             let (from, target) = (usize::saturating_sub(first, 1), (end + 1).min(grid.height));

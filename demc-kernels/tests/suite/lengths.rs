@@ -4,8 +4,14 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use demc_kernels::adam::Adam;
-use demc_kernels::conv3x3::Tile;
-use demc_kernels::{Grid, Isa, adam, batch_norm, conv1x1, conv3x3, deconv4x4, grid, pool, rel_mse};
+use demc_kernels::adam::AdamWeight;
+use demc_kernels::batch_norm::{BatchNorm, BatchNormSource, Moments};
+use demc_kernels::conv3x3::{PreparedConvolution, Tile};
+use demc_kernels::rel_mse::RelMse;
+use demc_kernels::{
+    Convolution, GradientSource, GradientTarget, Grid, Isa, adam, batch_norm, conv1x1, conv3x3,
+    deconv4x4, grid, pool, rel_mse,
+};
 
 const GRID: Grid = Grid {
     batch: 1,
@@ -44,6 +50,35 @@ fn checks<const N: usize>(name: &str, lengths: [usize; N], run: impl Fn(Isa, [&m
     }
 }
 
+fn rectified<'a>(weight: &'a [f32], bias: &'a [f32]) -> Convolution<'a> {
+    Convolution {
+        weight,
+        bias,
+        relu: true,
+    }
+}
+
+fn source<'a>(weight: &'a [f32], y: &'a [f32], dy: &'a [f32]) -> GradientSource<'a> {
+    GradientSource {
+        weight,
+        y: Some(y),
+        dy,
+    }
+}
+
+fn target<'a, X>(dx: X, dweight: &'a mut [f32], dbias: &'a mut [f32]) -> GradientTarget<'a, X> {
+    GradientTarget { dx, dweight, dbias }
+}
+
+fn norm<'a>(gamma: &'a [f32], beta: &'a [f32]) -> BatchNorm<'a> {
+    BatchNorm {
+        gamma,
+        beta,
+        epsilon: 1e-3,
+        relu: true,
+    }
+}
+
 #[test]
 fn convolutions() {
     // Wide, few inputs, few outputs: each has its own kernel.
@@ -54,7 +89,7 @@ fn convolutions() {
                 "conv3x3 forward",
                 [P * i, weight, o, P * o],
                 |isa, [x, w, b, y]| {
-                    conv3x3::forward_with(isa, tile, GRID, x, w, b, true, y);
+                    PreparedConvolution::new(isa, tile, rectified(w, b)).forward(GRID, x, 0, y);
                 },
             );
         }
@@ -62,7 +97,7 @@ fn convolutions() {
             "conv3x3 backward",
             [P * i, weight, P * o, P * o, P * i, weight, o],
             |isa, [x, w, y, dy, dx, dw, db]| {
-                conv3x3::backward(isa, GRID, x, w, Some(y), dy, Some(dx), dw, db);
+                conv3x3::backward(isa, GRID, x, source(w, y, dy), target(Some(dx), dw, db));
             },
         );
     }
@@ -76,14 +111,14 @@ fn deconvolution() {
         "deconv4x4 forward",
         [P * i, weight, o, 4 * P * o],
         |isa, [x, w, b, y]| {
-            deconv4x4::forward(isa, GRID, x, w, b, true, y);
+            deconv4x4::forward(isa, GRID, x, rectified(w, b), y);
         },
     );
     checks(
         "deconv4x4 backward",
         [P * i, weight, 4 * P * o, 4 * P * o, P * i, weight, o],
         |isa, [x, w, y, dy, dx, dw, db]| {
-            deconv4x4::backward(isa, GRID, x, w, Some(y), dy, Some(dx), dw, db);
+            deconv4x4::backward(isa, GRID, x, source(w, y, dy), target(Some(dx), dw, db));
         },
     );
 }
@@ -96,7 +131,7 @@ fn fusion() {
         "conv1x1 forward",
         [P * a, P * b, weight, o, P * o],
         |isa, [x, z, w, bias, y]| {
-            conv1x1::forward(isa, GRID, &[x, z], w, bias, true, y);
+            conv1x1::forward(isa, GRID, &[x, z], rectified(w, bias), y);
         },
     );
     checks(
@@ -105,7 +140,8 @@ fn fusion() {
         |isa, [x, z, w, y, dy, dx, dz, dw, db]| {
             let inputs: [&[f32]; 2] = [x, z];
             let mut gradients = [Some(dx), Some(dz)];
-            conv1x1::backward(isa, GRID, &inputs, w, Some(y), dy, &mut gradients, dw, db);
+            let target = target(&mut gradients[..], dw, db);
+            conv1x1::backward(isa, GRID, &inputs, source(w, y, dy), target);
         },
     );
 }
@@ -129,24 +165,33 @@ fn batch_normalisation() {
         "batch_norm forward_train",
         [n, c, c, n, c, c],
         |isa, [x, gamma, beta, y, mean, variance]| {
-            batch_norm::forward_train(isa, x, gamma, beta, 1e-3, true, y, mean, variance);
+            batch_norm::forward_train(isa, x, norm(gamma, beta), y, Moments { mean, variance });
         },
     );
     checks(
         "batch_norm forward_eval",
         [n, c, c, c, c, n],
         |isa, [x, gamma, beta, mean, variance, y]| {
-            batch_norm::forward_eval(isa, x, gamma, beta, mean, variance, 1e-3, true, y);
+            let moments = Moments {
+                mean: &*mean,
+                variance: &*variance,
+            };
+            batch_norm::forward_eval(isa, x, norm(gamma, beta), moments, y);
         },
     );
     checks(
         "batch_norm backward",
         [n, c, c, c, n, n, n, c, c],
         |isa, [x, gamma, mean, variance, y, dy, dx, dgamma, dbeta]| {
-            let y = Some(&*y);
-            batch_norm::backward(
-                isa, x, gamma, mean, variance, 1e-3, y, dy, dx, dgamma, dbeta,
-            );
+            let source = BatchNormSource {
+                x,
+                gamma,
+                moments: Moments { mean, variance },
+                epsilon: 1e-3,
+                y: Some(y),
+                dy,
+            };
+            batch_norm::backward(isa, source, dx, dgamma, dbeta);
         },
     );
 }
@@ -155,7 +200,12 @@ fn batch_normalisation() {
 fn loss_optimizer_and_layouts() {
     let n = 3 * P;
     checks("rel_mse", [n, n, n], |isa, [out, reference, dout]| {
-        rel_mse::loss(isa, out, reference, P, 2.2, 1e-3, Some(dout));
+        let scale = RelMse {
+            pixels: P,
+            gamma: 2.2,
+            epsilon: 1e-3,
+        };
+        rel_mse::loss(isa, out, reference, scale, Some(dout));
     });
     let rule = Adam {
         beta_1: 0.9,
@@ -167,7 +217,12 @@ fn loss_optimizer_and_layouts() {
         "adam",
         [n, n, n, n],
         |isa, [weight, grad, first, second]| {
-            adam::step(isa, &rule, 1, weight, grad, first, second);
+            let weight = AdamWeight {
+                weight,
+                first,
+                second,
+            };
+            adam::step(isa, &rule, 1, weight, grad);
         },
     );
     checks("NHWC from NCHW", [n, n], |_, [x, y]| {

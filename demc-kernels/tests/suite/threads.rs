@@ -1,6 +1,8 @@
 //! Convolutions give the same bits on any number of threads, on every instruction path.
 
-use demc_kernels::{Grid, Isa, conv1x1, conv3x3, deconv4x4};
+use demc_kernels::{
+    Convolution, GradientSource, GradientTarget, Grid, Isa, conv1x1, conv3x3, deconv4x4,
+};
 
 fn pattern(len: usize, seed: u32) -> Vec<f32> {
     let mut state = seed.wrapping_mul(2654435769);
@@ -43,6 +45,14 @@ const GRID: Grid = Grid {
     width: 45,
 };
 
+fn rectified<'a>(weight: &'a [f32], bias: &'a [f32]) -> Convolution<'a> {
+    Convolution {
+        weight,
+        bias,
+        relu: true,
+    }
+}
+
 macro_rules! convolution_gives_the_same {
     ($kernel:ident, $inputs:expr, $outputs:expr, $taps:expr, $pixels:expr) => {
         let x = pattern(GRID.pixels() * $inputs, 1);
@@ -51,11 +61,20 @@ macro_rules! convolution_gives_the_same {
         let name = format!("{} {} to {}", stringify!($kernel), $inputs, $outputs);
         assert_same(&name, |isa| {
             let mut y = vec![0.0; dy.len()];
-            $kernel::forward(isa, GRID, &x, &weight, &bias, true, &mut y);
+            $kernel::forward(isa, GRID, &x, rectified(&weight, &bias), &mut y);
             let mut dx = vec![0.0; x.len()];
             let (mut dweight, mut dbias) = (vec![0.0; weight.len()], vec![0.0; $outputs]);
-            let (dx_out, dw, db) = (Some(&mut dx[..]), &mut dweight, &mut dbias);
-            $kernel::backward(isa, GRID, &x, &weight, Some(&y), &dy, dx_out, dw, db);
+            let source = GradientSource {
+                weight: &weight,
+                y: Some(&y),
+                dy: &dy,
+            };
+            let target = GradientTarget {
+                dx: Some(&mut dx[..]),
+                dweight: &mut dweight,
+                dbias: &mut dbias,
+            };
+            $kernel::backward(isa, GRID, &x, source, target);
             vec![y, dx, dweight, dbias]
         });
     };
@@ -77,7 +96,7 @@ fn conv1x1_gives_the_same() {
     assert_same("conv1x1", |isa| {
         let views = [&xs[0][..], &xs[1][..]];
         let mut y = vec![0.0; dy.len()];
-        conv1x1::forward(isa, GRID, &views, &weight, &bias, true, &mut y);
+        conv1x1::forward(isa, GRID, &views, rectified(&weight, &bias), &mut y);
         let mut dxs = [vec![0.0; xs[0].len()], vec![0.0; xs[1].len()]];
         let (mut dweight, mut dbias) = (vec![0.0; weight.len()], vec![0.0; outputs]);
         let [first, second] = &mut dxs;
@@ -85,12 +104,16 @@ fn conv1x1_gives_the_same() {
             isa,
             GRID,
             &views,
-            &weight,
-            Some(&y),
-            &dy,
-            &mut [Some(first), Some(second)],
-            &mut dweight,
-            &mut dbias,
+            GradientSource {
+                weight: &weight,
+                y: Some(&y),
+                dy: &dy,
+            },
+            GradientTarget {
+                dx: &mut [Some(first), Some(second)],
+                dweight: &mut dweight,
+                dbias: &mut dbias,
+            },
         );
         let [first, second] = dxs;
         vec![y, first, second, dweight, dbias]

@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use demc_kernels::conv1x1::{self, Epilogue};
+use demc_kernels::conv1x1::{Epilogue, Part, add_part};
 use demc_kernels::deconv4x4::PreparedDeconvolution;
 use demc_kernels::{Grid, Isa, memory};
 
@@ -47,7 +47,7 @@ impl InferencePass<'_> {
         let [deconv, fusion] = convs;
         PreparedLevel {
             isa: self.isa,
-            deconv: PreparedDeconvolution::new(self.isa, deconv.weight(), deconv.bias(), true),
+            deconv: PreparedDeconvolution::new(self.isa, deconv.rectified()),
             fusion,
             epilogue: Epilogue {
                 bias: Some(fusion.bias()),
@@ -95,15 +95,11 @@ impl PreparedLevel<'_> {
             height: sum.len() / (grid.batch * 2 * grid.width * self.fusion.outputs()),
             ..grid.doubled()
         };
-        let (weight, epilogue) = (self.fusion.weight(), self.epilogue);
-        conv1x1::part(
-            self.isa,
-            decoded_grid,
-            &[&decoded],
-            weight,
-            0,
-            epilogue,
-            sum,
-        );
+        let part = Part {
+            weight: self.fusion.weight(),
+            first: 0,
+            epilogue: self.epilogue,
+        };
+        add_part(self.isa, decoded_grid, &[&decoded], part, sum);
     }
 }

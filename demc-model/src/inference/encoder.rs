@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use demc_kernels::conv1x1::{self, Epilogue};
+use demc_kernels::conv1x1::{Epilogue, Part, add_part};
 use demc_kernels::conv3x3::PreparedConvolution;
 use demc_kernels::{Grid, pool};
 
@@ -81,20 +81,15 @@ impl InferencePass<'_> {
         sum: &mut [f32],
     ) {
         // The decoder's channels are the first inputs of the fusion.
-        let first = (1 + encoder) * fusion.outputs();
-        let epilogue = Epilogue {
-            add: encoder > 0,
-            ..Epilogue::default()
+        let part = Part {
+            weight: fusion.weight(),
+            first: (1 + encoder) * fusion.outputs(),
+            epilogue: Epilogue {
+                add: encoder > 0,
+                ..Epilogue::default()
+            },
         };
-        conv1x1::part(
-            self.isa,
-            grid,
-            &[skip],
-            fusion.weight(),
-            first,
-            epilogue,
-            sum,
-        );
+        add_part(self.isa, grid, &[skip], part, sum);
     }
 
     /// The same on bands, encoder by encoder.
@@ -218,7 +213,7 @@ impl InferencePass<'_> {
     pub(super) fn chain<'a>(&self, convs: &'a [FoldedConv], grid: Grid) -> ConvChain<'a> {
         let (isa, tile) = (self.isa, self.tile);
         let banded = convs.iter().map(|conv| {
-            let prepared = PreparedConvolution::new(isa, tile, conv.weight(), conv.bias(), true);
+            let prepared = PreparedConvolution::new(isa, tile, conv.rectified());
             BandedConv::new(prepared, grid)
         });
         let outputs = convs.last().map_or(0, FoldedConv::outputs);

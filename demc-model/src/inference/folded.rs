@@ -5,6 +5,7 @@ use burn::backend::flex::FlexTensor;
 use burn::nn::BatchNorm;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
 use burn::tensor::Tensor;
+use demc_kernels::Convolution;
 
 /// Weight and bias of a convolution or deconvolution.
 ///
@@ -39,6 +40,15 @@ impl HostValues {
 }
 
 impl FoldedConv {
+    /// The convolution with a ReLU after it.
+    pub fn rectified(&self) -> Convolution<'_> {
+        Convolution {
+            weight: self.weight(),
+            bias: self.bias(),
+            relu: true,
+        }
+    }
+
     /// A convolution and the normalisation of its output, on `flex`.
     ///
     /// # Shapes

@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use burn::backend::flex::FlexTensor;
 use burn::tensor::Tensor;
-use demc_kernels::conv1x1::{self, Epilogue};
+use demc_kernels::conv1x1::{Epilogue, Part, add_part};
 use demc_kernels::{Grid, Isa, blend, filter5x5, grid, memory, power};
 use rayon::prelude::*;
 
@@ -92,20 +92,16 @@ impl KernelHead {
         let (conv, scale) = (&self.convs[level], &self.scales[level]);
         let band = scale.band(rows.len());
         let mut logits = memory::buffer(band.pixels() * conv.outputs());
-        let epilogue = Epilogue {
-            bias: Some(conv.bias()),
-            relu: false,
-            add: false,
+        let part = Part {
+            weight: conv.weight(),
+            first: 0,
+            epilogue: Epilogue {
+                bias: Some(conv.bias()),
+                relu: false,
+                add: false,
+            },
         };
-        conv1x1::part(
-            self.isa,
-            band,
-            &[decoded],
-            conv.weight(),
-            0,
-            epilogue,
-            &mut logits,
-        );
+        add_part(self.isa, band, &[decoded], part, &mut logits);
         let images = image..image + 1 + self.layers;
         let x = scale.images(images.clone());
         let grid = Grid {

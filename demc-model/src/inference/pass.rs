@@ -58,8 +58,7 @@ impl InferencePass<'_> {
     /// A convolution of whole maps with a ReLU.
     pub(super) fn conv3x3(&self, x: &FeatureMaps, conv: &FoldedConv) -> FeatureMaps {
         let mut y = FeatureMaps::new(x.grid, conv.outputs());
-        let (weight, bias) = (conv.weight(), conv.bias());
-        let prepared = PreparedConvolution::new(self.isa, self.tile, weight, bias, true);
+        let prepared = PreparedConvolution::new(self.isa, self.tile, conv.rectified());
         prepared.forward(x.grid, &x.values, 0, &mut y.values);
         y
     }

@@ -202,10 +202,12 @@ impl UpdateOps for Flex {
             Isa::current(),
             &constants,
             step,
-            weight.storage_mut(),
+            demc_kernels::adam::AdamWeight {
+                weight: weight.storage_mut(),
+                first: first.storage_mut(),
+                second: second.storage_mut(),
+            },
             values(&grad),
-            first.storage_mut(),
-            second.storage_mut(),
         );
         (weight, first, second)
     }

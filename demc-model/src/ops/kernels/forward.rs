@@ -2,8 +2,11 @@
 
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
+use demc_kernels::batch_norm::{BatchNorm, Moments};
+use demc_kernels::rel_mse::RelMse;
 use demc_kernels::{
-    Grid, Isa, batch_norm, blend, conv1x1, conv3x3, deconv4x4, filter5x5, grid, pool, rel_mse,
+    Convolution, Grid, Isa, batch_norm, blend, conv1x1, conv3x3, deconv4x4, filter5x5, grid, pool,
+    rel_mse,
 };
 
 use super::{KernelOps, buffer, contiguous, dims, grid, maps, tensor, values};
@@ -39,9 +42,11 @@ impl KernelOps for Flex {
             Isa::current(),
             grid,
             values(&x),
-            values(&weight),
-            values(&bias),
-            relu,
+            Convolution {
+                weight: values(&weight),
+                bias: values(&bias),
+                relu,
+            },
             &mut y,
         );
         maps(grid, y)
@@ -56,9 +61,11 @@ impl KernelOps for Flex {
             Isa::current(),
             grid,
             values(&x),
-            values(&weight),
-            values(&bias),
-            relu,
+            Convolution {
+                weight: values(&weight),
+                bias: values(&bias),
+                relu,
+            },
             &mut y,
         );
         maps(grid.doubled(), y)
@@ -135,12 +142,16 @@ impl KernelOps for Flex {
         batch_norm::forward_eval(
             Isa::current(),
             values(&x),
-            values(&gamma),
-            values(&beta),
-            values(&mean),
-            values(&variance),
-            epsilon,
-            relu,
+            BatchNorm {
+                gamma: values(&gamma),
+                beta: values(&beta),
+                epsilon,
+                relu,
+            },
+            Moments {
+                mean: values(&mean),
+                variance: values(&variance),
+            },
             &mut y,
         );
         tensor(y, dims::<4>(&x))
@@ -160,13 +171,17 @@ impl KernelOps for Flex {
         batch_norm::forward_train(
             Isa::current(),
             values(&x),
-            values(&gamma),
-            values(&beta),
-            epsilon,
-            relu,
+            BatchNorm {
+                gamma: values(&gamma),
+                beta: values(&beta),
+                epsilon,
+                relu,
+            },
             &mut y,
-            &mut mean,
-            &mut variance,
+            Moments {
+                mean: &mut mean,
+                variance: &mut variance,
+            },
         );
         (
             tensor(y, dims::<4>(&x)),
@@ -202,9 +217,13 @@ pub(super) fn rel_mse_into(
     let images = values(out_gamma)
         .chunks(image)
         .zip(values(ref_hdr).chunks(image));
+    let scale = RelMse {
+        pixels: height * width,
+        gamma,
+        epsilon,
+    };
     let loss = |out: &[f32], reference: &[f32], dout: Option<&mut [f32]>| {
-        let pixels = height * width;
-        rel_mse::loss(Isa::current(), out, reference, pixels, gamma, epsilon, dout) as f32
+        rel_mse::loss(Isa::current(), out, reference, scale, dout) as f32
     };
     let losses: Vec<f32> = match dout {
         Some(dout) => images
@@ -233,9 +252,11 @@ pub(super) fn fuse<const P: usize>(
         Isa::current(),
         grid,
         &parts.each_ref().map(values),
-        values(&weight),
-        values(&bias),
-        relu,
+        Convolution {
+            weight: values(&weight),
+            bias: values(&bias),
+            relu,
+        },
         &mut y,
     );
     maps(grid, y)

@@ -5,7 +5,7 @@ use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::flex::FlexTensor;
-use demc_kernels::{Grid, Isa, conv1x1, conv3x3, deconv4x4};
+use demc_kernels::{GradientSource, GradientTarget, Grid, Isa, conv1x1, conv3x3, deconv4x4};
 
 use super::super::{buffer, contiguous, dims, grid, maps, tensor, values};
 
@@ -17,19 +17,8 @@ pub(super) struct ConvState<const P: usize> {
     pub(super) y: Option<FlexTensor>,
 }
 
-struct ConvGradients<'a, const P: usize> {
-    grid: Grid,
-    inputs: [&'a [f32]; P],
-    weight: &'a [f32],
-    y: Option<&'a [f32]>,
-    dy: &'a [f32],
-    dinputs: [Option<&'a mut [f32]>; P],
-    dweight: &'a mut [f32],
-    dbias: &'a mut [f32],
-}
-
-/// The backward pass of a convolution. `kernel` fills the buffers; those with a node are
-/// registered.
+/// The backward pass of a convolution. `kernel` gets grid, inputs, and source, and fills the target;
+/// gradients with a node are registered.
 ///
 /// The nodes belong to the inputs, the weight and the bias, in this order. The weight's axis
 /// `output_axis` has the output channels.
@@ -37,7 +26,7 @@ fn backward_convolution<const P: usize, const N: usize>(
     ops: Ops<ConvState<P>, N>,
     grads: &mut Gradients,
     output_axis: usize,
-    kernel: impl FnOnce(ConvGradients<P>),
+    kernel: impl FnOnce(Grid, [&[f32]; P], GradientSource, GradientTarget<[Option<&mut [f32]>; P]>),
 ) {
     let dy = contiguous(grads.consume::<Flex>(&ops.node));
     let ConvState { inputs, weight, y } = ops.state;
@@ -53,16 +42,20 @@ fn backward_convolution<const P: usize, const N: usize>(
     });
     let mut dweight = buffer(values(&weight).len());
     let mut dbias = buffer(shape[output_axis]);
-    kernel(ConvGradients {
+    kernel(
         grid,
-        inputs: inputs.each_ref().map(values),
-        weight: values(&weight),
-        y: y.as_ref().map(values),
-        dy: values(&dy),
-        dinputs: dinputs.each_mut().map(Option::as_deref_mut),
-        dweight: &mut dweight,
-        dbias: &mut dbias,
-    });
+        inputs.each_ref().map(values),
+        GradientSource {
+            weight: values(&weight),
+            y: y.as_ref().map(values),
+            dy: values(&dy),
+        },
+        GradientTarget {
+            dx: dinputs.each_mut().map(Option::as_deref_mut),
+            dweight: &mut dweight,
+            dbias: &mut dbias,
+        },
+    );
     for (node, dinput) in input_nodes.into_iter().zip(dinputs) {
         if let (Some(node), Some(dinput)) = (node, dinput) {
             grads.register::<Flex>(node.id, maps(grid, dinput));
@@ -91,10 +84,14 @@ macro_rules! backward {
                 grads: &mut Gradients,
                 _: &mut Checkpointer,
             ) {
-                backward_convolution(ops, grads, $axis, |g| {
-                    let ([x], [dx], isa) = (g.inputs, g.dinputs, Isa::current());
-                    let (dw, db) = (g.dweight, g.dbias);
-                    $kernel::backward(isa, g.grid, x, g.weight, g.y, g.dy, dx, dw, db);
+                backward_convolution(ops, grads, $axis, |grid, [x], source, target| {
+                    let GradientTarget {
+                        dx: [dx],
+                        dweight,
+                        dbias,
+                    } = target;
+                    let target = GradientTarget { dx, dweight, dbias };
+                    $kernel::backward(Isa::current(), grid, x, source, target);
                 });
             }
         }
@@ -112,18 +109,13 @@ impl<const P: usize, const N: usize> Backward<Flex, N> for Fuse<P> {
     type State = ConvState<P>;
 
     fn backward(self, ops: Ops<Self::State, N>, grads: &mut Gradients, _: &mut Checkpointer) {
-        backward_convolution(ops, grads, 0, |mut g| {
-            conv1x1::backward(
-                Isa::current(),
-                g.grid,
-                &g.inputs,
-                g.weight,
-                g.y,
-                g.dy,
-                &mut g.dinputs,
-                g.dweight,
-                g.dbias,
-            );
+        backward_convolution(ops, grads, 0, |grid, inputs, source, mut target| {
+            let target = GradientTarget {
+                dx: &mut target.dx[..],
+                dweight: target.dweight,
+                dbias: target.dbias,
+            };
+            conv1x1::backward(Isa::current(), grid, &inputs, source, target);
         });
     }
 }

@@ -13,6 +13,7 @@ use burn::backend::autodiff::ops::{Backward, NodeGuard, Ops, OpsKind};
 use burn::backend::flex::FlexTensor;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, AutodiffBackend, Flex};
+use demc_kernels::batch_norm::{BatchNormSource, Moments};
 use demc_kernels::{Isa, batch_norm, blend, filter5x5, pool};
 
 use super::forward::{fuse, rel_mse_into};
@@ -278,19 +279,18 @@ impl Backward<Flex, 3> for BatchNorm {
         let (grid, channels) = grid(&x);
         let mut dx = buffer(values(&x).len());
         let [mut dgamma, mut dbeta] = [buffer(channels), buffer(channels)];
-        batch_norm::backward(
-            Isa::current(),
-            values(&x),
-            values(&gamma),
-            values(&statistics[0]),
-            values(&statistics[1]),
+        let source = BatchNormSource {
+            x: values(&x),
+            gamma: values(&gamma),
+            moments: Moments {
+                mean: values(&statistics[0]),
+                variance: values(&statistics[1]),
+            },
             epsilon,
-            y.as_ref().map(values),
-            values(&dy),
-            &mut dx,
-            &mut dgamma,
-            &mut dbeta,
-        );
+            y: y.as_ref().map(values),
+            dy: values(&dy),
+        };
+        batch_norm::backward(Isa::current(), source, &mut dx, &mut dgamma, &mut dbeta);
         let gradients = [
             maps(grid, dx),
             tensor(dgamma, [channels]),

@@ -1,0 +1,40 @@
+//! The operands of convolutions by name.
+
+/// A convolution and the ReLU after it.
+///
+/// # Shapes
+/// `bias` `[out]`; `weight` as each kernel says.
+#[derive(Clone, Copy, Debug)]
+pub struct Convolution<'a> {
+    /// Weight.
+    pub weight: &'a [f32],
+    /// Bias.
+    pub bias: &'a [f32],
+    /// Whether the output is rectified.
+    pub relu: bool,
+}
+
+/// What the gradients of a convolution are computed from, beside its inputs.
+///
+/// # Shapes
+/// `weight` as each kernel says; `y` and `dy` that of the output.
+#[derive(Clone, Copy, Debug)]
+pub struct GradientSource<'a> {
+    /// Weight.
+    pub weight: &'a [f32],
+    /// The output, if it was rectified: `dy` counts only where it is positive.
+    pub y: Option<&'a [f32]>,
+    /// Gradient with respect to the output.
+    pub dy: &'a [f32],
+}
+
+/// Where the gradients of a convolution are written. Each has the shape of its value.
+#[derive(Debug)]
+pub struct GradientTarget<'a, X = Option<&'a mut [f32]>> {
+    /// With respect to the input; one for each where there are several. `None`: not computed.
+    pub dx: X,
+    /// With respect to the weight.
+    pub dweight: &'a mut [f32],
+    /// With respect to the bias.
+    pub dbias: &'a mut [f32],
+}
