@@ -12,7 +12,7 @@ use exr::meta::attribute::{LevelMode, SampleType};
 
 fn inputs(target: &str) -> Vec<PathBuf> {
     let dir = Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("../fuzz")
+        .join("../tests/fuzz")
         .join(target);
     let files = fs::read_dir(&dir).unwrap_or_else(|error| panic!("{}: {error}", dir.display()));
     let mut files: Vec<_> = files.map(|file| file.expect("readable").path()).collect();

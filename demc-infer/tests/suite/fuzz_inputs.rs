@@ -11,7 +11,7 @@ use safetensors::tensor::{Dtype, TensorView};
 
 fn folder(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("../fuzz")
+        .join("../tests/fuzz")
         .join(name)
 }
 
