@@ -28,6 +28,18 @@ pub struct Written {
     pub changes: Vec<Change>,
 }
 
+/// The channels that get other values: the layout's colour, its alpha if there is a plane for it,
+/// and layers.
+#[derive(Debug, Clone, Copy)]
+pub struct Replaced<'a> {
+    /// Names the colour and alpha.
+    pub layout: &'a ChannelLayout,
+    /// The names of further channels.
+    pub layers: &'a [String],
+    /// Their values: colour, and alpha if given, as for [`rewrite`], then a plane for each layer.
+    pub planes: &'a [f32],
+}
+
 /// As [`rewrite`], for the file at `input`.
 ///
 /// # Errors
@@ -66,32 +78,32 @@ pub fn rewrite<R: Read + Seek>(
     output: &Path,
     options: &WriteOptions,
 ) -> Result<Written, Error> {
-    rewrite_with_layers(file, layout, &[], color_hdr, output, options)
+    let replaced = Replaced {
+        layout,
+        layers: &[],
+        planes: color_hdr,
+    };
+    rewrite_with_layers(file, &replaced, output, options)
 }
 
-/// As [`rewrite`], with further channels, `layers`, that have other values.
-///
-/// # Shapes
-/// `planes` are the colour, and alpha if given, as for `rewrite`, then a plane for each layer.
+/// As [`rewrite`], with layers that have other values too.
 ///
 /// # Errors
 /// As [`rewrite`]; for layers as for the colour's channels.
 pub fn rewrite_with_layers<R: Read + Seek>(
     file: &mut ExrFile<R>,
-    layout: &ChannelLayout,
-    layers: &[String],
-    planes: &[f32],
+    replaced: &Replaced<'_>,
     output: &Path,
     options: &WriteOptions,
 ) -> Result<Written, Error> {
-    let layout = layout.in_file(file, None)?;
+    let layout = replaced.layout.in_file(file, None)?;
     let names = ReplacedNames {
         color: &layout.color,
         alpha: layout.alpha.as_deref(),
-        layers,
+        layers: replaced.layers,
     };
-    let plan = RewritePlan::new(file, &names, planes.len(), options)?;
-    let clamped = recode(file, &plan, planes, output)?;
+    let plan = RewritePlan::new(file, &names, replaced.planes.len(), options)?;
+    let clamped = recode(file, &plan, replaced.planes, output)?;
     Ok(Written {
         clamped,
         changes: plan.changes,

@@ -8,7 +8,7 @@ use crate::support::{half, layout, named, write};
 use demc_data::image::exr::ExrFile;
 use demc_data::image::frame::layers::{check_layers, decode_layers};
 use demc_data::image::plane::Plane;
-use demc_data::image::rewrite::rewrite_with_layers;
+use demc_data::image::rewrite::{Replaced, rewrite_with_layers};
 use demc_data::{Error, OutputChannels, SamplePrecision, WriteOptions};
 use exr::prelude::{Compression as Method, FlatSamples, SampleType};
 
@@ -39,14 +39,21 @@ fn layers_of_any_part_have_other_values_and_everything_else_stays() {
         values.extend((0..count * PIXELS).map(|i| -((i % 1021) as f32) / 4.0));
         let mut file = ExrFile::open(&input).expect("a file");
         let options = WriteOptions::default();
-        let written = rewrite_with_layers(&mut file, &layout, &layers, &values, &output, &options);
-        written.expect("written");
+        let replaced = Replaced {
+            layout: &layout,
+            layers: &layers,
+            planes: &values,
+        };
+        rewrite_with_layers(&mut file, &replaced, &output, &options).expect("written");
         let alpha = with_alpha.then_some("main.A");
-        let replaced = ["main.R", "main.G", "main.B"].into_iter().chain(alpha);
-        let replaced: Vec<&str> = replaced.chain(layers.iter().map(|name| &**name)).collect();
+        let names: Vec<&str> = ["main.R", "main.G", "main.B"]
+            .into_iter()
+            .chain(alpha)
+            .chain(layers.iter().map(String::as_str))
+            .collect();
         for ((channel, before), (same, after)) in planes(&input).into_iter().zip(planes(&output)) {
             assert_eq!(channel, same);
-            match replaced.iter().position(|name| *name == channel.name) {
+            match names.iter().position(|name| *name == channel.name) {
                 Some(plane) => {
                     let expected = &values[plane * PIXELS..][..PIXELS];
                     assert!(after.to_f32() == expected, "{}", channel.name);
@@ -73,9 +80,12 @@ fn only_colour_and_layers_stay_on_request_as_float() {
         ..WriteOptions::default()
     };
     let mut file = ExrFile::open(&input).expect("a file");
-    let layers = names(&["sun.R"]);
-    rewrite_with_layers(&mut file, &layout(), &layers, &values, &output, &options)
-        .expect("written");
+    let replaced = Replaced {
+        layout: &layout(),
+        layers: &names(&["sun.R"]),
+        planes: &values,
+    };
+    rewrite_with_layers(&mut file, &replaced, &output, &options).expect("written");
     let after = planes(&output);
     let kept: Vec<&str> = after
         .iter()

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use demc_data::image::exr::{Compression, ExrFile};
 use demc_data::image::frame::{decode_input, decode_repaired};
-use demc_data::image::rewrite::{OutputChannels, WriteOptions, rewrite_with_layers};
+use demc_data::image::rewrite::{OutputChannels, Replaced, WriteOptions, rewrite_with_layers};
 use demc_data::{ChannelLayout, Frame};
 use demc_program::message;
 use demc_program::output::{Directories, Outputs};
@@ -350,13 +350,6 @@ enum OutputPrecision {
     Float,
 }
 
-/// The channels with other values: colour, alpha if there is a plane for it, and layers.
-struct Replaced<'a> {
-    layout: &'a ChannelLayout,
-    layers: &'a [String],
-    planes: &'a [f32],
-}
-
 impl OutputFlags {
     /// Writes `output`: `input` with the denoised channels. Returns notes about other differences
     /// from the input.
@@ -378,12 +371,7 @@ impl OutputFlags {
             }),
             compression: self.compression,
         };
-        let Replaced {
-            layout,
-            layers,
-            planes,
-        } = replaced;
-        let written = rewrite_with_layers(input, layout, layers, planes, output, &options)?;
+        let written = rewrite_with_layers(input, replaced, output, &options)?;
         let mut notes: Vec<String> = written.changes.iter().map(ToString::to_string).collect();
         if written.clamped > 0 {
             let clamped = written.clamped;
