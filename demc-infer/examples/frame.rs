@@ -51,7 +51,11 @@ fn render() -> Frame {
         for _ in 0..SAMPLES {
             let x = ((pixel % WIDTH) as f32 + random() - WIDTH as f32 / 2.0) / HEIGHT as f32;
             let y = ((pixel / WIDTH) as f32 + random() - HEIGHT as f32 / 2.0) / HEIGHT as f32;
-            let (position, normal, texture) = hit([x, -y, -1.0]);
+            let Hit {
+                position,
+                normal,
+                albedo,
+            } = hit([x, -y, -1.0]);
             // A random point of the lamp, and its direct light.
             let to = [0.0f32, 0.0, 0.0].map(|_| random());
             let light = [LAMP[0] + to[0], LAMP[1], LAMP[2] + to[2]];
@@ -61,10 +65,10 @@ fn render() -> Frame {
             let irradiance = LAMP_RADIANCE * cosines / square;
             // The second hit is the lamp, which counts as white, or nothing.
             let second = [f32::from(irradiance > 0.0); 3];
-            let planes = [normal, position, texture, second];
+            let planes = [normal, position, albedo, second];
             for channel in 0..3 {
                 let share = 1.0 / SAMPLES as f32;
-                let radiance = texture[channel] / std::f32::consts::PI * irradiance;
+                let radiance = albedo[channel] / std::f32::consts::PI * irradiance;
                 color[channel * pixels + pixel] += share * radiance;
                 for (buffer, value) in planes.iter().enumerate() {
                     features[(3 * buffer + channel) * pixels + pixel] += share * value[channel];
@@ -75,8 +79,15 @@ fn render() -> Frame {
     Frame::new("room", WIDTH, HEIGHT, color, features)
 }
 
-/// Position, normal and albedo at the first hit of a ray from the camera.
-fn hit(ray: Vec3) -> (Vec3, Vec3, Vec3) {
+/// What a ray sees.
+struct Hit {
+    position: Vec3,
+    normal: Vec3,
+    albedo: Vec3,
+}
+
+/// The first hit of a ray from the camera.
+fn hit(ray: Vec3) -> Hit {
     let wall = -CAMERA[2] / ray[2];
     let floor = if ray[1] < 0.0 {
         -CAMERA[1] / ray[1]
@@ -87,14 +98,22 @@ fn hit(ray: Vec3) -> (Vec3, Vec3, Vec3) {
     if floor < wall {
         let position: Vec3 = at(floor);
         let dark = (position[0].floor() + position[2].floor()).rem_euclid(2.0) < 0.5;
-        let texture = if dark {
+        let albedo = if dark {
             [0.1, 0.12, 0.15]
         } else {
             [0.7, 0.6, 0.5]
         };
-        (position, [0.0, 1.0, 0.0], texture)
+        Hit {
+            position,
+            normal: [0.0, 1.0, 0.0],
+            albedo,
+        }
     } else {
-        (at(wall), [0.0, 0.0, 1.0], [0.5, 0.35, 0.3])
+        Hit {
+            position: at(wall),
+            normal: [0.0, 0.0, 1.0],
+            albedo: [0.5, 0.35, 0.3],
+        }
     }
 }
 

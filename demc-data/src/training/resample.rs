@@ -106,11 +106,12 @@ impl Surface<'_> {
             let squares = a.into_iter().zip(b).map(|(a, b)| (a - b) * (a - b));
             squares.sum::<f32>() <= limit * limit
         };
-        let (r, q) = pair(self.reference);
-        let (r, q) = (r.iter().sum::<f32>() + BLACK, q.iter().sum::<f32>() + BLACK);
+        let light = |rgb: [f32; 3]| rgb.iter().sum::<f32>() + BLACK;
+        let (of_a, of_b) = pair(self.reference);
+        let (light_a, light_b) = (light(of_a), light(of_b));
         near(pair(self.normal), NORMAL)
             && near(pair(self.texture), TEXTURE)
-            && r.max(q) <= LIGHT * r.min(q)
+            && light_a.max(light_b) <= LIGHT * light_a.min(light_b)
     }
 }
 
@@ -121,11 +122,16 @@ mod tests {
     const SIZE: usize = 64;
     const PIXELS: usize = SIZE * SIZE;
 
-    /// Colour, features and reference of a wall and a floor. The right half is lit four times as
-    /// much as the left half; the floor starts at row 48. One pixel in four has light, four times
-    /// its reference. The noise of the floor is half as strong. The second texture holds the number
-    /// of the noise.
-    fn room() -> (Vec<f32>, Vec<f32>, Vec<f32>) {
+    struct Room {
+        color: Vec<f32>,
+        features: Vec<f32>,
+        reference: Vec<f32>,
+    }
+
+    /// A wall and a floor. The right half is lit four times as much as the left half; the floor
+    /// starts at row 48. One pixel in four has light, four times its reference. The noise of the
+    /// floor is half as strong. The second texture holds the number of the noise.
+    fn room() -> Room {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let mut features = vec![0.0; FEATURES * PIXELS];
         let mut color = vec![0.0; 3 * PIXELS];
@@ -134,24 +140,32 @@ mod tests {
             let (floor, right) = (pixel / SIZE >= 48, pixel % SIZE >= SIZE / 2);
             features[if floor { 1 } else { 2 } * PIXELS + pixel] = 1.0;
             let level = if right { 0.8 } else { 0.2 };
-            let noise = if rng.random_range(0..4) == 0 {
+            let lit = if rng.random_range(0..4) == 0 {
                 4.0
             } else {
                 0.0
             };
-            let noise = if floor { 0.5 * noise + 0.5 } else { noise };
+            let noise = if floor { 0.5 * lit + 0.5 } else { lit };
             for plane in 0..3 {
                 reference[plane * PIXELS + pixel] = level;
                 color[plane * PIXELS + pixel] = noise * level;
                 features[(TEXTURES + 3 + plane) * PIXELS + pixel] = noise;
             }
         }
-        (color, features, reference)
+        Room {
+            color,
+            features,
+            reference,
+        }
     }
 
     #[test]
     fn noise_is_another_of_the_same_surface_in_the_same_light() {
-        let (color, features, reference) = room();
+        let Room {
+            color,
+            features,
+            reference,
+        } = room();
         let (mut varied, mut varied_features) = (color.clone(), features.clone());
         resample_noise(&mut varied, &mut varied_features, &reference, SIZE, 1);
         let moved = (0..PIXELS)
@@ -193,10 +207,10 @@ mod tests {
 
     #[test]
     fn a_seed_draws_one_noise() {
-        let (color, features, reference) = room();
+        let room = room();
         let drawn = |seed| {
-            let (mut color, mut features) = (color.clone(), features.clone());
-            resample_noise(&mut color, &mut features, &reference, SIZE, seed);
+            let (mut color, mut features) = (room.color.clone(), room.features.clone());
+            resample_noise(&mut color, &mut features, &room.reference, SIZE, seed);
             (color, features)
         };
         assert_eq!(drawn(1), drawn(1));
@@ -207,7 +221,11 @@ mod tests {
     /// source.
     #[test]
     fn a_pixel_that_is_like_no_other_keeps_its_noise() {
-        let (mut color, mut features, mut reference) = room();
+        let Room {
+            mut color,
+            mut features,
+            mut reference,
+        } = room();
         let steps = 2 * REACH as usize + 1;
         for pixel in 0..PIXELS {
             features[TEXTURES * PIXELS + pixel] = 0.2 * (pixel / SIZE % steps) as f32;

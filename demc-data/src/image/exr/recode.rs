@@ -135,19 +135,30 @@ impl<R: Read + Seek> Recoder<'_, R> {
         let mut carried = CarriedChannels::new(from, grid, &source.meta.headers[from], origins);
         for batch in targets(header)?.chunks(batch) {
             carried.fetch(&mut self.input, batch)?;
-            let code = |target: &OutputBlock| -> Result<(usize, Chunk, usize), ExrError> {
+            let code = |target: &OutputBlock| -> Result<CodedBlock, ExrError> {
                 let (data, clamped) = assemble(header, target, self.planes, &carried);
-                let chunk = compress(part, header, target, data)?;
-                Ok((target.index, chunk, clamped))
+                Ok(CodedBlock {
+                    index: target.index,
+                    chunk: compress(part, header, target, data)?,
+                    clamped,
+                })
             };
             for coded in parallel::map(threads, batch.iter().collect(), code) {
-                let (index, chunk, clamped) = coded?;
-                blocks.write_chunk(index, chunk)?;
-                self.clamped += clamped;
+                let coded = coded?;
+                blocks.write_chunk(coded.index, coded.chunk)?;
+                self.clamped += coded.clamped;
             }
         }
         Ok(())
     }
+}
+
+/// A compressed block of the output.
+struct CodedBlock {
+    index: usize,
+    chunk: Chunk,
+    /// Replaced samples beyond the range of half.
+    clamped: usize,
 }
 
 pub(super) struct OutputBlock {
@@ -270,12 +281,12 @@ impl CarriedChannels {
         if !self.contents.iter().any(carries) {
             return Ok(());
         }
-        let places = targets.iter().flat_map(|target| {
+        let of_targets = targets.iter().flat_map(|target| {
             let (column, first) = self.grid.place(target.corner);
             let (_, last) = self.grid.place(target.corner + target.size - Vec2(1, 1));
             (first..=last).map(move |row| (column, row))
         });
-        let places: BTreeSet<BlockPosition> = places.collect();
+        let places: BTreeSet<BlockPosition> = of_targets.collect();
         self.blocks.retain(|place, _| places.contains(place));
         let missing: Vec<BlockPosition> = places
             .into_iter()
@@ -326,8 +337,9 @@ fn sorted(header: &Header) -> Result<Vec<u8>, ExrError> {
     let mut rest = &bytes[..bytes.len() - 1];
     let mut attributes = Vec::new();
     while !rest.is_empty() {
-        let length = length(rest).filter(|&length| length <= rest.len());
-        let length = length.ok_or_else(|| invalid("an attribute cannot be written".to_owned()))?;
+        let length = length(rest)
+            .filter(|&length| length <= rest.len())
+            .ok_or_else(|| invalid("an attribute cannot be written".to_owned()))?;
         let (attribute, others) = rest.split_at(length);
         attributes.push(attribute);
         rest = others;
