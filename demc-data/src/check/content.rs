@@ -44,11 +44,11 @@ pub fn suspicious(planes: &FramePlanes, layout: &ChannelLayout) -> Vec<ContentPr
         }
     }
     let buffers = layout.features().into_iter();
-    for ((buffer, _, missing), planes) in buffers.zip(planes.features.chunks_exact(3)) {
+    for (buffer, planes) in buffers.zip(planes.features.chunks_exact(3)) {
         // With a policy the buffer may be absent from the file.
-        let is_read = missing == Missing::Error;
+        let is_read = buffer.missing == Missing::Error;
         if is_read && planes.iter().all(|plane| plane.constant().is_some()) {
-            report(format!("{buffer} is constant"), false);
+            report(format!("{} is constant", buffer.name), false);
         }
     }
     found

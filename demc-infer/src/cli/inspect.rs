@@ -174,13 +174,13 @@ fn buffers(layout: &ChannelLayout) -> Vec<BufferRow> {
         missing,
     };
     let mut rows = vec![row("color", Some(&layout.color), "refused")];
-    for (buffer, names, missing) in layout.features() {
-        let missing = match missing {
+    for feature in layout.features() {
+        let missing = match feature.missing {
             Missing::Error => "refused",
             Missing::Zeros => "zeros",
             Missing::CopyTexture1 => "texture1",
         };
-        rows.push(row(buffer, names, missing));
+        rows.push(row(feature.name, feature.channels, missing));
     }
     rows.push(row("reference", layout.reference.as_ref(), "no scores"));
     rows

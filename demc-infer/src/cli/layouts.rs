@@ -5,7 +5,7 @@ use std::path::Path;
 
 use clap::Args;
 use demc_data::image::exr::ExrFile;
-use demc_data::image::layout::{FileLayout, Missing, detect};
+use demc_data::image::layout::{FeatureBuffer, FileLayout, Missing, detect};
 use demc_data::{ChannelLayout, Dataset, Error};
 use demc_program::exit::UsageError;
 use demc_program::message;
@@ -135,13 +135,18 @@ fn describe(found: &FileLayout) -> String {
     if let Some(layer) = &found.layer {
         text += &format!(", view layer {layer:?}");
     }
-    let policies = found.layout.features();
-    let absent = policies.iter().filter(|(_, names, _)| names.is_none());
-    for (buffer, _, policy) in absent {
-        text += &match policy {
-            Missing::CopyTexture1 => format!("; no {buffer}: texture1 replaces it"),
-            _ => format!("; no {buffer}: zeros replace it"),
-        };
+    for FeatureBuffer {
+        name,
+        channels,
+        missing,
+    } in found.layout.features()
+    {
+        if channels.is_none() {
+            text += &match missing {
+                Missing::CopyTexture1 => format!("; no {name}: texture1 replaces it"),
+                _ => format!("; no {name}: zeros replace it"),
+            };
+        }
     }
     text
 }

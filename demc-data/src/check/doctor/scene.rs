@@ -69,8 +69,8 @@ pub(super) fn examine(
             format!("{:.1} % of the samples", 100.0 * negative),
         );
     }
-    let correlation = noise::correlation(&frame.color, width, height);
-    let correlation = correlation.filter(|value| *value >= CORRELATED);
+    let correlation = noise::correlation(&frame.color, width, height)
+        .filter(|correlation| *correlation >= CORRELATED);
     if let Some(correlation) = correlation {
         add(
             "noise of neighbouring pixels correlates",
@@ -145,13 +145,13 @@ fn features(name: &str, frame: &Frame, layout: &ChannelLayout) -> Vec<Finding> {
     let pixels = frame.width * frame.height;
     let mut findings = Vec::new();
     let buffers = frame.features.chunks_exact(3 * pixels);
-    for ((buffer, names, _), planes) in layout.features().into_iter().zip(buffers) {
+    for (buffer, planes) in layout.features().into_iter().zip(buffers) {
         // A policy replaces a buffer without names.
-        if names.is_some()
+        if buffer.channels.is_some()
             && let Some(color) = constant(planes, pixels)
         {
             findings.push(Finding::new(
-                &format!("{buffer} is constant"),
+                &format!("{} is constant", buffer.name),
                 "the renderer does not write this buffer; leave it out of the layout or enable it",
                 name,
                 format!("{color:?}"),

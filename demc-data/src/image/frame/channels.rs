@@ -32,15 +32,15 @@ impl<'a> FrameChannels<'a> {
             Presence::Required => true,
         };
         let mut features: Vec<Option<&str>> = Vec::with_capacity(FEATURES);
-        for (buffer, names, missing) in layout.features() {
-            match (names, missing) {
+        for buffer in layout.features() {
+            match (buffer.channels, buffer.missing) {
                 // If one of the three channels is present, the buffer counts as present, and the
                 // other channels are missing.
                 (Some(names), policy) if policy == Missing::Error || is_present(names) => {
                     features.extend(slots(names))
                 }
                 (None, Missing::Error) => {
-                    let detail = format!("{buffer} names no channels and has no policy");
+                    let detail = format!("{} names no channels and has no policy", buffer.name);
                     return Err(Error::Layout {
                         name: "in use".to_owned(),
                         detail,
@@ -55,9 +55,10 @@ impl<'a> FrameChannels<'a> {
             .as_ref()
             .filter(|names| read(reference, &names[..]));
         let single = |name: &'a Option<String>, presence| {
-            let names = name.iter();
-            let names = names.filter(move |name| read(presence, std::slice::from_ref(name)));
-            names.map(|name| Some(name.as_str())).collect()
+            name.iter()
+                .filter(move |name| read(presence, std::slice::from_ref(name)))
+                .map(|name| Some(name.as_str()))
+                .collect()
         };
         // Files of renderers differ in whether they have an alpha channel.
         let alpha = match mask {

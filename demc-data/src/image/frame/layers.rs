@@ -4,7 +4,7 @@ use std::io::{Read, Seek};
 
 use super::read::finite;
 use crate::error::Error;
-use crate::image::channel::{Channel, ChannelType};
+use crate::image::channel::ChannelType;
 use crate::image::exr::ExrFile;
 use crate::image::layout::ChannelLayout;
 
@@ -23,9 +23,8 @@ pub fn check_layers<R: Read + Seek>(
     file.require(&names)?;
     let color: &str = &layout.color[0];
     file.require(&[color])?;
-    let find = |name: &&str| file.channel(name);
-    let color: Vec<&Channel> = [color].iter().filter_map(find).collect();
-    for channel in names.iter().filter_map(find) {
+    let color = file.channel(color);
+    for channel in names.iter().filter_map(|name| file.channel(name)) {
         let refuse = |detail: String| Error::Layer {
             path: file.path().to_owned(),
             channel: channel.name.clone(),
@@ -37,7 +36,7 @@ pub fn check_layers<R: Read + Seek>(
         if let Some(buffer) = role(layout, &channel.name) {
             return Err(refuse(format!("it is the {buffer} that the network sees")));
         }
-        if let Some(color) = color.iter().find(|color| color.window != channel.window) {
+        if let Some(color) = color.filter(|color| color.window != channel.window) {
             return Err(Error::Sizes {
                 path: file.path().to_owned(),
                 a: color.name.clone(),
@@ -52,11 +51,12 @@ pub fn check_layers<R: Read + Seek>(
 
 /// The buffer that the network sees as a channel, if any.
 fn role(layout: &ChannelLayout, channel: &str) -> Option<&'static str> {
-    let color = [("colour", Some(&layout.color))].into_iter();
-    let features = layout.features();
-    let features = features.iter().map(|(buffer, names, _)| (*buffer, *names));
-    let mut buffers = color.chain(features);
-    let (buffer, _) = buffers
+    let features = layout
+        .features()
+        .map(|feature| (feature.name, feature.channels));
+    let (buffer, _) = [("colour", Some(&layout.color))]
+        .into_iter()
+        .chain(features)
         .find(|(_, names)| names.is_some_and(|names| names.iter().any(|name| name == channel)))?;
     Some(buffer)
 }

@@ -110,6 +110,17 @@ impl Alternatives {
     }
 }
 
+/// A feature buffer of a layout.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FeatureBuffer<'a> {
+    /// Its name, as in [`crate::image::layout`]: `normal`, `position`, `texture1`, or `texture2`.
+    pub name: &'static str,
+    /// Its channels, if the layout names any.
+    pub channels: Option<&'a Triple>,
+    /// What to do if a file lacks it.
+    pub missing: Missing,
+}
+
 /// The replacement for each missing feature buffer.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -199,47 +210,54 @@ impl ChannelLayout {
 
     /// The four feature buffers in the network's order, each with its policy: normal, position,
     /// texture1, texture2.
-    pub fn features(&self) -> [(&'static str, Option<&Triple>, Missing); 4] {
+    pub fn features(&self) -> [FeatureBuffer<'_>; 4] {
+        let buffer = |name, channels, missing| FeatureBuffer {
+            name,
+            channels,
+            missing,
+        };
         [
-            ("normal", self.normal.as_ref(), self.missing.normal),
-            ("position", self.position.as_ref(), self.missing.position),
-            ("texture1", self.texture1.as_ref(), self.missing.texture1),
-            ("texture2", self.texture2.as_ref(), self.missing.texture2),
+            buffer("normal", self.normal.as_ref(), self.missing.normal),
+            buffer("position", self.position.as_ref(), self.missing.position),
+            buffer("texture1", self.texture1.as_ref(), self.missing.texture1),
+            buffer("texture2", self.texture2.as_ref(), self.missing.texture2),
         ]
     }
 
     /// All problems of this layout, one phrase each.
     pub fn validate(&self) -> Vec<String> {
         let mut problems = Vec::new();
-        for (buffer, names, missing) in self.features() {
-            if names.is_none() && missing == Missing::Error {
+        let features = self.features();
+        for FeatureBuffer {
+            name,
+            channels,
+            missing,
+        } in features
+        {
+            if channels.is_none() && missing == Missing::Error {
                 problems.push(format!(
-                    "{buffer} names no channels: name them or set missing.{buffer}"
+                    "{name} names no channels: name them or set missing.{name}"
                 ));
             }
-            if missing == Missing::CopyTexture1 && buffer != "texture2" {
+            if missing == Missing::CopyTexture1 && name != "texture2" {
                 problems.push(format!(
-                    "missing.{buffer} cannot be \"copy-texture1\": only texture2 can"
+                    "missing.{name} cannot be \"copy-texture1\": only texture2 can"
                 ));
             }
         }
-        for ((buffer, names, _), others) in self
-            .features()
-            .into_iter()
-            .zip(self.alternatives.in_order())
+        for (FeatureBuffer { name, channels, .. }, others) in
+            features.into_iter().zip(self.alternatives.in_order())
         {
-            if names.is_none() && !others.is_empty() {
+            if channels.is_none() && !others.is_empty() {
                 problems.push(format!(
-                    "alternatives.{buffer} needs {buffer}, the names that come first"
+                    "alternatives.{name} needs {name}, the names that come first"
                 ));
             }
         }
         let mut seen = HashSet::new();
-        let features = self
-            .features()
-            .into_iter()
-            .filter_map(|(_, names, _)| names);
         let all = features
+            .iter()
+            .filter_map(|feature| feature.channels)
             .chain([&self.color])
             .chain(&self.reference)
             .chain(self.alternatives.in_order().into_iter().flatten())
@@ -266,9 +284,8 @@ fn mistake(name: &str, detail: String) -> Error {
 }
 
 fn one_line(error: &toml::de::Error, text: &str) -> String {
-    let message = error.message().trim_end().replace('\n', ", ");
     // A key may contain terminal control codes.
-    let message = printable(&message);
+    let message = printable(&error.message().trim_end().replace('\n', ", "));
     match error.span() {
         Some(span) => {
             let line = text[..span.start.min(text.len())].lines().count().max(1);

@@ -25,9 +25,12 @@ pub struct FileLayout {
 impl FileLayout {
     /// The feature buffers that the file lacks.
     pub fn absent(&self) -> Vec<&'static str> {
-        let features = self.layout.features().into_iter();
-        let absent = features.filter(|(_, names, _)| names.is_none());
-        absent.map(|(buffer, ..)| buffer).collect()
+        self.layout
+            .features()
+            .iter()
+            .filter(|feature| feature.channels.is_none())
+            .map(|feature| feature.name)
+            .collect()
     }
 }
 
@@ -114,8 +117,10 @@ impl ChannelLayout {
         if !self.has_any_layer() {
             return Vec::new();
         }
-        let color = self.color.each_ref();
-        let color = color.map(|name| name.strip_prefix('*').unwrap_or(name));
+        let color = self
+            .color
+            .each_ref()
+            .map(|name| name.strip_prefix('*').unwrap_or(name));
         let channels = file.channels().iter();
         let layers = channels.filter_map(|channel| channel.name.strip_suffix(color[0]));
         let is_whole = |layer: &&str| {
@@ -205,11 +210,11 @@ pub fn detect<R: Read + Seek>(
             continue;
         };
         for layer in layers {
-            let layout = match &layer {
+            let of_layer = match &layer {
                 Some(layer) => pattern.with_layer(layer),
                 None => pattern.clone(),
             };
-            let layout = layout.named_as_in(file);
+            let layout = of_layer.named_as_in(file);
             let (found, lacking) = found_and_lacking(file, &layout, missing);
             if lacking.is_empty() {
                 fits.push(FileLayout {
@@ -252,8 +257,8 @@ pub fn detect<R: Read + Seek>(
                 format!("no preset fits; the nearest, {preset}, lacks {lacking}")
             }
             None => {
-                let names = file.channels().iter().map(|channel| channel.name.clone());
-                let names = list(&names.collect::<Vec<_>>());
+                let channels = file.channels().iter().map(|channel| channel.name.clone());
+                let names = list(&channels.collect::<Vec<_>>());
                 format!("no preset has any of its channels: {names}")
             }
         },
@@ -275,12 +280,18 @@ fn found_and_lacking<R: Read + Seek>(
     layout: &ChannelLayout,
     missing: MissingPolicies,
 ) -> (usize, Vec<String>) {
-    let features = layout.features().into_iter().zip(missing.in_order());
-    let features = features.filter_map(|((_, names, _), policy)| Some((names?, policy)));
+    let features = layout
+        .features()
+        .into_iter()
+        .zip(missing.in_order())
+        .filter_map(|(feature, policy)| Some((feature.channels?, policy)));
     let (mut found, mut lacking) = (0, Vec::new());
     for (names, policy) in std::iter::once((&layout.color, Missing::Error)).chain(features) {
-        let absent = names.iter().filter(|name| file.channel(name).is_none());
-        let absent: Vec<String> = absent.cloned().collect();
+        let absent: Vec<String> = names
+            .iter()
+            .filter(|name| file.channel(name).is_none())
+            .cloned()
+            .collect();
         found += names.len() - absent.len();
         // One channel of three is a mistake, not a missing buffer.
         if policy == Missing::Error || absent.len() < names.len() {

@@ -23,6 +23,7 @@ mod detect;
 mod tests;
 
 pub use channels::{
-    ANY_LAYER, Alternatives, ChannelLayout, Missing, MissingPolicies, PRESETS, Triple,
+    ANY_LAYER, Alternatives, ChannelLayout, FeatureBuffer, Missing, MissingPolicies, PRESETS,
+    Triple,
 };
 pub use detect::{FileLayout, detect};

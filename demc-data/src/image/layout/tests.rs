@@ -128,10 +128,15 @@ const RGB: [&str; 3] = ["R", "G", "B"];
 /// The channels of `layout`'s buffers except `without`, with a view layer in place of `*`.
 fn names(preset: &str, without: &[&str], layers: &[&str]) -> Vec<String> {
     let layout = ChannelLayout::resolve(preset).expect("a preset");
-    let features = layout.features().into_iter();
-    let features = features.filter(|(buffer, ..)| !without.contains(buffer));
-    let features = features.filter_map(|(_, names, _)| names.cloned());
-    let names: Vec<String> = features.chain([layout.color.clone()]).flatten().collect();
+    let names: Vec<String> = layout
+        .features()
+        .into_iter()
+        .filter(|feature| !without.contains(&feature.name))
+        .filter_map(|feature| feature.channels)
+        .chain([&layout.color])
+        .flatten()
+        .cloned()
+        .collect();
     let layers = layers.iter();
     layers
         .flat_map(|layer| names.iter().map(move |name| name.replacen('*', layer, 1)))

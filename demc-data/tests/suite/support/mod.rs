@@ -51,7 +51,7 @@ pub fn scene_channels(width: usize, height: usize) -> Vec<(String, FlatSamples)>
     let features = layout
         .features()
         .into_iter()
-        .filter_map(|(_, names, _)| names.cloned());
+        .filter_map(|feature| feature.channels.cloned());
     let triples = [layout.color.clone()]
         .into_iter()
         .chain(features)
