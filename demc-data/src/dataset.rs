@@ -186,9 +186,9 @@ impl Dataset {
         seed: u64,
     ) -> Result<(Vec<Scene>, Vec<Scene>), Error> {
         let scenes = self.split(Split::Train)?;
-        let bases: BTreeSet<&str> = scenes.iter().map(|scene| scene.base.as_str()).collect();
+        let sorted: BTreeSet<&str> = scenes.iter().map(|scene| scene.base.as_str()).collect();
         // The list is sorted, so the order of the manifest does not matter.
-        let mut bases: Vec<&str> = bases.into_iter().collect();
+        let mut bases: Vec<&str> = sorted.into_iter().collect();
         bases.shuffle(&mut generator(RandomStream::Validation, seed, 0, 0));
         bases.truncate(held_out(share, bases.len()));
         let held: HashSet<String> = bases.into_iter().map(str::to_owned).collect();

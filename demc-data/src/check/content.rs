@@ -70,11 +70,11 @@ pub fn by_problem(found: &[(String, Vec<ContentProblem>)]) -> Vec<String> {
 
 /// The fatal problems, as [`by_problem`], if every scene has one; otherwise nothing.
 pub fn unusable(found: &[(String, Vec<ContentProblem>)]) -> Vec<String> {
-    let fatal = found.iter().map(|(scene, problems)| {
+    let fatal_of = |(scene, problems): &(String, Vec<ContentProblem>)| {
         let fatal = problems.iter().filter(|problem| problem.is_fatal);
         (scene.clone(), fatal.cloned().collect::<Vec<_>>())
-    });
-    let fatal: Vec<_> = fatal.collect();
+    };
+    let fatal: Vec<_> = found.iter().map(fatal_of).collect();
     if fatal.iter().any(|(_, problems)| problems.is_empty()) {
         Vec::new()
     } else {

@@ -152,8 +152,8 @@ impl Plane {
             let near = (1..=MAX_RADIUS).find_map(|radius| {
                 let rows = y.saturating_sub(radius)..(y + radius + 1).min(height);
                 let columns = x.saturating_sub(radius)..(x + radius + 1).min(width);
-                let rows = rows.map(|y| &samples[y * width..][columns.clone()]);
-                median(rows.flatten().copied().filter(is_sound))
+                let square = rows.flat_map(|y| &samples[y * width..][columns.clone()]);
+                median(square.copied().filter(is_sound))
             });
             let value = near.unwrap_or_else(|| {
                 *of_plane.get_or_insert_with(|| {

@@ -28,8 +28,8 @@ pub struct Rgb {
 pub fn read_rgb(path: &Path) -> Result<Rgb, Error> {
     let mut file = ExrFile::open(path)?;
     let prefix = prefix(&file);
-    let names = ["R", "G", "B"].map(|channel| format!("{prefix}{channel}"));
-    let names = names.each_ref().map(String::as_str);
+    let full_names = ["R", "G", "B"].map(|channel| format!("{prefix}{channel}"));
+    let names = full_names.each_ref().map(String::as_str);
     file.require(&names)?;
     let [window, others @ ..] = names.map(|name| file.channel(name).expect("required").window);
     for (name, other) in names[1..].iter().zip(others) {

@@ -46,8 +46,10 @@ impl PositionMap {
     pub fn of(features: &[f32]) -> Self {
         let pixels = features.len() / FEATURES;
         let position = |i: usize| [0, 1, 2].map(|axis| features[(POSITIONS + axis) * pixels + i]);
-        let hits = (0..pixels).filter(|i| is_hit(features, pixels, *i));
-        let hits: Vec<[f32; 3]> = hits.map(position).collect();
+        let hits: Vec<[f32; 3]> = (0..pixels)
+            .filter(|i| is_hit(features, pixels, *i))
+            .map(position)
+            .collect();
         let center = [0, 1, 2].map(|axis| median(hits.iter().map(|hit| hit[axis])).unwrap_or(0.0));
         let distances: Vec<f32> = hits.iter().map(|hit| distance(*hit, center)).collect();
         let extent = match median(distances.iter().copied()) {

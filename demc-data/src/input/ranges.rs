@@ -48,9 +48,8 @@ impl FrameSummary {
             let samples = hit_samples(channel, plane.to_vec(), frame.mask.as_deref());
             ChannelMoments::of(&samples)
         };
-        let features = parallel::map(threads().count, planes.collect(), moments);
-        let mut features = features.into_iter();
-        let features = std::array::from_fn(|_| features.next().unwrap_or_default());
+        let mut measured = parallel::map(threads().count, planes.collect(), moments).into_iter();
+        let features = std::array::from_fn(|_| measured.next().unwrap_or_default());
         Self::new(&frame.color, &features)
     }
 
@@ -124,8 +123,10 @@ impl Ranges {
         let (mut mean, mut std) = (self.mean, self.std);
         let axes = mean[..TEXTURES].chunks_mut(3);
         for (mean, std) in axes.zip(std[..TEXTURES].chunks_mut(3)) {
-            let farthest = mean.iter().map(|range| range.high.max(-range.low));
-            let farthest = farthest.fold(0.0, f32::max);
+            let farthest = mean
+                .iter()
+                .map(|range| range.high.max(-range.low))
+                .fold(0.0, f32::max);
             mean.fill(Range {
                 low: -farthest,
                 high: farthest,

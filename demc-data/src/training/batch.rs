@@ -178,8 +178,10 @@ impl PatchSource {
         let color = batch.color_gamma.chunks_exact_mut(3 * pixels);
         let features = batch.features_z.chunks_exact_mut(FEATURES * pixels);
         let reference = batch.reference_hdr.chunks_exact_mut(3 * pixels);
-        let modulation = batch.modulation.iter_mut();
-        let mut modulation = modulation.flat_map(|all| all.chunks_exact_mut(3 * pixels));
+        let mut modulation = batch
+            .modulation
+            .iter_mut()
+            .flat_map(|all| all.chunks_exact_mut(3 * pixels));
         let mut places: Vec<PatchBuffers> = draws
             .into_iter()
             .zip(color.zip(features.zip(reference)))

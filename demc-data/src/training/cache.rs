@@ -152,8 +152,8 @@ impl CachedScenes {
                 .scenes
                 .iter()
                 .min_by_key(|(_, entry)| entry.last_use)
-                .map(|(&index, _)| index);
-            let oldest = oldest.expect("bytes are counted for entries only");
+                .map(|(&index, _)| index)
+                .expect("bytes are counted for entries only");
             let gone = self.scenes.remove(&oldest).expect("it was just found");
             self.bytes -= gone.planes.bytes();
         }
@@ -181,11 +181,12 @@ fn filter_albedo(
         alpha: None,
         ..*planes
     };
-    let filtered = filter(&frame_of(input, path)?).map_err(|source| Error::AlbedoFilter {
-        path: path.to_owned(),
-        source,
-    })?;
-    let filtered = filtered.unwrap_or_default();
+    let filtered = filter(&frame_of(input, path)?)
+        .map_err(|source| Error::AlbedoFilter {
+            path: path.to_owned(),
+            source,
+        })?
+        .unwrap_or_default();
     let albedo = planes.features[TEXTURES..].iter_mut();
     for (plane, filtered) in albedo.zip(filtered.chunks_exact(planes.width * planes.height)) {
         *plane = Plane::Float(filtered.to_vec());

@@ -178,8 +178,8 @@ mod tests {
         let mut scenes = [scene("few", 256, 128), scene("many", 128, 128)];
         scenes[1].repeat = NonZero::new(3).expect("not 0");
         let patches = patches(&scenes, 128, 128).expect("large enough");
-        let scenes: Vec<u32> = patches.iter().map(|patch| patch.scene).collect();
-        assert_eq!(scenes, [0, 0, 1, 1, 1]);
+        let drawn: Vec<u32> = patches.iter().map(|patch| patch.scene).collect();
+        assert_eq!(drawn, [0, 0, 1, 1, 1]);
         assert!(patches[2..].iter().all(|patch| *patch == patches[2]));
     }
 

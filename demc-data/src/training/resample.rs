@@ -52,10 +52,10 @@ pub fn resample_noise(
         3 * pixels,
         "the reference must be [3, size, size]"
     );
-    let (surface, second) = features.split_at_mut((TEXTURES + 3) * pixels);
+    let (first, second) = features.split_at_mut((TEXTURES + 3) * pixels);
     let surface = Surface {
-        normal: &surface[..3 * pixels],
-        texture: &surface[TEXTURES * pixels..],
+        normal: &first[..3 * pixels],
+        texture: &first[TEXTURES * pixels..],
         reference,
         pixels,
     };

@@ -78,9 +78,9 @@ pub(super) fn headers(root: &Path, files: &[PathBuf], layout: Option<&str>) -> R
             };
             format!("{layout} fits {}{more}", files[0])
         });
-        let groups = groups.collect::<Vec<_>>().join(", ");
         problems.push(format!(
-            "the files have several layouts: {groups}; use one directory for each"
+            "the files have several layouts: {}; use one directory for each",
+            groups.collect::<Vec<_>>().join(", ")
         ));
     }
     refuse(root, problems)?;
@@ -90,8 +90,11 @@ pub(super) fn headers(root: &Path, files: &[PathBuf], layout: Option<&str>) -> R
 fn header(root: &Path, relative: &Path, chosen: Option<&(&str, ChannelLayout)>) -> Result<Found> {
     let path = root.join(relative);
     let shown = path.display();
-    let parts = relative.iter().map(|part| part.to_str());
-    let Some(parts) = parts.collect::<Option<Vec<_>>>() else {
+    let Some(parts) = relative
+        .iter()
+        .map(|part| part.to_str())
+        .collect::<Option<Vec<_>>>()
+    else {
         bail!("{shown}: its name is not UTF-8");
     };
     let file = ExrFile::open(&path)?;

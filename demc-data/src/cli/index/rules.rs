@@ -93,8 +93,8 @@ impl Rules {
                     .captures(path)
                     .and_then(|groups| groups.get(1))
                     .map(|group| group.as_str()),
-            };
-            let base = base.filter(|base| !base.is_empty());
+            }
+            .filter(|base| !base.is_empty());
             if base.is_none() {
                 problems.push(format!("{file}: --base finds no base scene in {path}"));
             }
@@ -123,11 +123,11 @@ fn leaks(scenes: &[Entry]) -> Vec<String> {
     }
     let leaks = examples.into_iter().filter(|(_, files)| files.len() > 1);
     let phrase = |(base, files): (&str, BTreeMap<Split, &str>)| {
-        let files: Vec<String> = files
+        let files = files
             .into_iter()
             .map(|(split, file)| format!("{file} is in {split}"))
-            .collect();
-        let files = files.join(", ");
+            .collect::<Vec<_>>()
+            .join(", ");
         format!("base scene {base} would be in both splits ({files}); change --test or --base")
     };
     leaks.map(phrase).collect()

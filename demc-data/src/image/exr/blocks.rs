@@ -122,19 +122,19 @@ impl<R: Read + Seek> BlockReader<R> {
         grid: &BlockGrid,
         places: &[BlockPosition],
     ) -> Result<Vec<UncompressedBlock>, ExrError> {
-        let blocks = places
+        let loaded: Vec<LoadedBlock> = places
             .iter()
             .map(|&place| match self.kept.take(part, place) {
                 Some(block) => Ok(LoadedBlock::Decoded(block)),
                 None => self.block(part, grid, place).map(LoadedBlock::Compressed),
-            });
-        let blocks: Vec<LoadedBlock> = blocks.collect::<Result<_, _>>()?;
+            })
+            .collect::<Result<_, ExrError>>()?;
         let meta = &self.meta;
-        let blocks = parallel::map(self.threads, blocks, |block| match block {
+        let decoded = parallel::map(self.threads, loaded, |block| match block {
             LoadedBlock::Decoded(block) => Ok(block),
             LoadedBlock::Compressed(chunk) => decompress(meta, chunk),
         });
-        blocks.into_iter().collect()
+        decoded.into_iter().collect()
     }
 
     fn block(
@@ -147,9 +147,11 @@ impl<R: Read + Seek> BlockReader<R> {
             tile_index: Vec2(column, row),
             level_index: Vec2(0, 0),
         };
-        let offset = grid.offsets.get(row * grid.columns + column).copied();
-        let offset = offset.ok_or_else(|| invalid("it has too few blocks".to_owned()))?;
-        self.chunk(part, offset, place)
+        let offset = grid
+            .offsets
+            .get(row * grid.columns + column)
+            .ok_or_else(|| invalid("it has too few blocks".to_owned()))?;
+        self.chunk(part, *offset, place)
     }
 
     /// Offsets of the blocks of a part, in the order of the format: levels, then rows, then
@@ -201,8 +203,7 @@ impl<R: Read + Seek> BlockReader<R> {
                 ));
             }
         }
-        let size = integer(&mut self.reader)?;
-        let size = u64::try_from(size)
+        let size = u64::try_from(integer(&mut self.reader)?)
             .map_err(|_| invalid("the size of a block is negative".to_owned()))?;
         let room = self.length - self.reader.stream_position()?.min(self.length);
         if size > room {

@@ -37,8 +37,12 @@ pub(super) fn decompress(meta: &MetaData, chunk: Chunk) -> Result<UncompressedBl
         if let Compression::DWAA(_) | Compression::DWAB(_) = header.compression
             && !stored
         {
-            let sizes = bytes.as_chunks().0.iter().take(DWA_SIZES);
-            let mut sizes = sizes.map(|&bytes| u64::from_le_bytes(bytes));
+            let mut sizes = bytes
+                .as_chunks()
+                .0
+                .iter()
+                .take(DWA_SIZES)
+                .map(|&bytes| u64::from_le_bytes(bytes));
             // Samples of 8x8 squares, including partial ones, of two or four bytes, plus the growth
             // that compression may add.
             let Vec2(width, height) = area;

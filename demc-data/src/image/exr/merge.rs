@@ -202,8 +202,11 @@ fn joined_header<R: Read + Seek>(
         }
     }
     // The name of the only part of the first file is no part of the channels' names.
-    let layer_name = first.own_attributes.layer_name.clone();
-    let layer_name = layer_name.filter(|_| headers(&inputs[0]).len() == 1);
+    let layer_name = first
+        .own_attributes
+        .layer_name
+        .clone()
+        .filter(|_| headers(&inputs[0]).len() == 1);
     conflicts.sort_unstable();
     conflicts.dedup();
 
@@ -218,9 +221,10 @@ fn joined_header<R: Read + Seek>(
         attribute::write(name, value, &mut bytes)?;
     }
     bytes.push(0);
-    let mut parsed = MetaData::read_from_buffered(&bytes[..], false)?.headers;
-    let parsed = parsed.pop();
-    let mut header = parsed.ok_or_else(|| invalid("it has no header".to_owned()))?;
+    let mut header = MetaData::read_from_buffered(&bytes[..], false)?
+        .headers
+        .pop()
+        .ok_or_else(|| invalid("it has no header".to_owned()))?;
     header.own_attributes.layer_name = layer_name;
     header.channels = ChannelList::new(columns.iter().map(|c| description(inputs, c)).collect());
 
@@ -228,12 +232,12 @@ fn joined_header<R: Read + Seek>(
     let kept = Compression::of(first.compression)
         .filter(|_| kinds.all(|kind| first.compression.is_lossless_for(kind)));
     let compression = kept.map_or(Compression::Zip.method(), |_| first.compression);
-    let header = header.with_encoding(
+    let encoded = header.with_encoding(
         compression,
         BlockDescription::ScanLines,
         LineOrder::Increasing,
     );
-    Ok((header, conflicts))
+    Ok((encoded, conflicts))
 }
 
 fn description<R: Read + Seek>(inputs: &[MergeInput<R>], column: &Column) -> ChannelDescription {

@@ -134,8 +134,10 @@ impl RewritePlan {
             changes: Vec::new(),
         };
         for (input, header) in file.source.meta.headers.iter().enumerate() {
-            let channels = file.channels().iter().filter(|c| c.part == input);
-            let origins: Vec<ChannelOrigin> = channels
+            let origins: Vec<ChannelOrigin> = file
+                .channels()
+                .iter()
+                .filter(|channel| channel.part == input)
                 .filter_map(|channel| origin(channel, &replaced, color, options.channels))
                 .collect();
             if origins.is_empty() {
@@ -227,7 +229,7 @@ fn colored_header(
 ) -> Header {
     let name = input.own_attributes.layer_name.as_ref();
     let part = name.map_or(String::new(), printable);
-    let channels = origins.iter().map(|origin| {
+    let written = origins.iter().map(|origin| {
         let mut channel = input.channels.list[origin.index].clone();
         if origin.plane.is_some() {
             channel.sample_type = match options.precision {
@@ -238,7 +240,7 @@ fn colored_header(
         }
         channel
     });
-    let channels = ChannelList::new(channels.collect());
+    let channels = ChannelList::new(written.collect());
 
     let lossless = |compression: Compression| {
         let others = origins.iter().filter(|origin| origin.plane.is_none());

@@ -65,9 +65,11 @@ impl<R: Read + Seek> ExrFile<R> {
         let source = guarded(path, || BlockReader::open(reader))?;
         let headers = &source.meta.headers;
         let several = headers.len() > 1;
-        let parts = headers.iter().enumerate();
-        let channels = parts.flat_map(|(part, header)| channels_of(part, header, several));
-        let channels: Vec<Channel> = channels.collect();
+        let channels: Vec<Channel> = headers
+            .iter()
+            .enumerate()
+            .flat_map(|(part, header)| channels_of(part, header, several))
+            .collect();
         let mut by_name = HashMap::with_capacity(channels.len());
         for (index, channel) in channels.iter().enumerate() {
             by_name.entry(channel.name.clone()).or_insert(index);
@@ -154,8 +156,9 @@ impl<R: Read + Seek> ExrFile<R> {
         // A file that cannot hold its pixels is damaged, whatever memory there is.
         guarded(&self.path, || {
             let parts: BTreeSet<usize> = wanted.iter().map(|channel| channel.part).collect();
-            let mut parts = parts.into_iter();
-            parts.try_for_each(|part| self.source.grid(part).map(drop))
+            parts
+                .into_iter()
+                .try_for_each(|part| self.source.grid(part).map(drop))
         })?;
         self.reserve(&wanted, &mut planes)?;
         guarded(&self.path, || {
@@ -190,8 +193,8 @@ impl<R: Read + Seek> ExrFile<R> {
 
 fn channels_of(part: usize, header: &Header, several: bool) -> Vec<Channel> {
     let layer = header.own_attributes.layer_name.as_ref().map(printable);
-    let channels = header.channels.list.iter().enumerate();
-    let channels = channels.map(|(index, channel)| Channel {
+    let described = header.channels.list.iter().enumerate();
+    let channels = described.map(|(index, channel)| Channel {
         name: full_name(
             layer.as_deref().filter(|_| several),
             &printable(&channel.name),
