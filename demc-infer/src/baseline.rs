@@ -103,9 +103,12 @@ pub fn check(baselines: &[Baseline], scenes: &[Scene]) -> Result<(), BaselineErr
         }
     }
     for baseline in baselines {
-        let paths = scenes.iter().map(|scene| baseline.path(scene));
-        let missing = paths.filter(|path| !path.is_file());
-        let paths: Vec<_> = missing.map(|path| path.display().to_string()).collect();
+        let paths: Vec<_> = scenes
+            .iter()
+            .map(|scene| baseline.path(scene))
+            .filter(|path| !path.is_file())
+            .map(|path| path.display().to_string())
+            .collect();
         if !paths.is_empty() {
             return Err(BaselineError::Missing {
                 name: baseline.name.clone(),

@@ -118,11 +118,11 @@ impl Tiles {
         let cut = |length: usize, axis: &AxisCut| {
             spans(length / DOWNSAMPLING, axis.count, halo).collect()
         };
-        let best = best.map(|(rows, columns)| Self {
+        best.map(|(rows, columns)| Self {
             rows: cut(height, rows),
             columns: cut(width, columns),
-        });
-        best.ok_or_else(|| {
+        })
+        .ok_or_else(|| {
             let smallest = (2 * halo + DOWNSAMPLING).min(height.max(width));
             TooLarge {
                 width,

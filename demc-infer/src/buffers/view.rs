@@ -73,8 +73,10 @@ impl Placement {
     /// Checks that no two samples share memory: each stride passes over all samples of the smaller
     /// ones.
     fn disjoint(self) -> Result<Self, BufferError> {
-        let axes = self.shape.iter().zip(self.strides);
-        let mut axes: Vec<(usize, usize)> = axes
+        let mut axes: Vec<(usize, usize)> = self
+            .shape
+            .iter()
+            .zip(self.strides)
             .filter(|(count, _)| **count > 1)
             .map(|(count, stride)| (stride.unsigned_abs(), *count))
             .collect();
@@ -150,8 +152,8 @@ impl<'a> View<'a> {
             shape,
             first,
             strides,
-        };
-        let placement = placement.within(bytes.len())?;
+        }
+        .within(bytes.len())?;
         Ok(Self { bytes, placement })
     }
 
@@ -239,8 +241,9 @@ impl<'a> ViewMut<'a> {
             shape,
             first,
             strides,
-        };
-        let placement = placement.within(bytes.len())?.disjoint()?;
+        }
+        .within(bytes.len())?
+        .disjoint()?;
         Ok(Self { bytes, placement })
     }
 

@@ -41,9 +41,10 @@ impl<'a> SummedTensor<'a> {
 /// The checksum of a bundle whose header entry, with an empty `sha256`, is `entry`.
 pub(super) fn of_bundle(entry: &str, mut tensors: Vec<SummedTensor<'_>>) -> String {
     tensors.sort_by_key(|tensor| tensor.name);
-    let tensors = tensors.iter();
-    let tensors = tensors.flat_map(|tensor| [tensor.line.as_bytes(), tensor.bytes]);
-    sha256([entry.as_bytes()].into_iter().chain(tensors))
+    let parts = tensors
+        .iter()
+        .flat_map(|tensor| [tensor.line.as_bytes(), tensor.bytes]);
+    sha256([entry.as_bytes()].into_iter().chain(parts))
 }
 
 /// Compares a file with the checksum `sum` in its header entry.
@@ -56,16 +57,16 @@ pub(super) fn check(
     sum: &str,
     file: &SafeTensors<'_>,
 ) -> Result<(), BundleError> {
-    let views = file.iter();
-    let views =
-        views.map(|(name, view)| SummedTensor::new(name, view.dtype(), view.shape(), view.data()));
+    let tensors = file
+        .iter()
+        .map(|(name, view)| SummedTensor::new(name, view.dtype(), view.shape(), view.data()));
     // An empty checksum is one of the ways in which the digits can be damaged.
     let blank = if sum.is_empty() {
         String::new()
     } else {
         entry.replacen(sum, "", 1)
     };
-    if of_bundle(&blank, views.collect()) == sum {
+    if of_bundle(&blank, tensors.collect()) == sum {
         Ok(())
     } else {
         Err(BundleError::Checksum { path: path.into() })
@@ -86,7 +87,7 @@ pub fn sums(dir: &Path) -> Result<Vec<(String, String)>, BundleError> {
         Ok(bytes) => String::from_utf8(bytes).map_err(|_| invalid("not UTF-8 text".into()))?,
         Err(source) => return Err(BundleError::Read { path, source }),
     };
-    let pairs = text.lines().map(|line| match line.split_once("  ") {
+    let lines = text.lines().map(|line| match line.split_once("  ") {
         Some((sum, name)) => Ok((sum.to_owned(), name.to_owned())),
         None => {
             let line = printable(line);
@@ -95,7 +96,7 @@ pub fn sums(dir: &Path) -> Result<Vec<(String, String)>, BundleError> {
             )))
         }
     });
-    let pairs: Vec<_> = pairs.collect::<Result<_, _>>()?;
+    let pairs: Vec<_> = lines.collect::<Result<_, _>>()?;
     if pairs.is_empty() {
         Err(invalid("empty".into()))
     } else {

@@ -96,8 +96,10 @@ impl BundleFile {
         let mut weights = Vec::with_capacity(tensors.len());
         let mut filter_weights = Vec::new();
         let mut specs = names.specs_in_file(&header.meta.model);
-        let filter = header.albedo_filter.as_ref();
-        let mut filter_specs = filter.map(|filter| names.specs_in_file(&filter.model));
+        let mut filter_specs = header
+            .albedo_filter
+            .as_ref()
+            .map(|filter| names.specs_in_file(&filter.model));
         for (name, view) in tensors.iter() {
             if view.dtype() == Dtype::F16 {
                 precision = Precision::F16;
@@ -131,8 +133,9 @@ impl BundleFile {
             weights,
             albedo_filter,
         };
-        let filter = header.albedo_filter;
-        let filter = filter.map(|meta| Box::new(file(meta, filter_weights, None)));
+        let filter = header
+            .albedo_filter
+            .map(|meta| Box::new(file(meta, filter_weights, None)));
         Ok(file(header.meta, weights, filter))
     }
 }
@@ -202,8 +205,11 @@ pub(super) struct BundleHeader {
 /// The bytes are no safetensors file, or no bundle.
 pub(super) fn parse_meta(path: &Path, bytes: &[u8]) -> Result<BundleHeader, BundleError> {
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|error| damaged(path, &error))?;
-    let entry = header.metadata().as_ref().and_then(|all| all.get(KEY));
-    let entry = entry.ok_or_else(|| BundleError::Foreign { path: path.into() })?;
+    let entry = header
+        .metadata()
+        .as_ref()
+        .and_then(|all| all.get(KEY))
+        .ok_or_else(|| BundleError::Foreign { path: path.into() })?;
     parse_header(entry, path)
 }
 

@@ -58,8 +58,9 @@ impl Tensors<'_> {
         for spec in model.weight_specs() {
             let called = format!("{prefix}{}", Names::Torch.in_file(&spec));
             let found = &mut self.found;
-            let view = found.remove(&called);
-            let view = view.or_else(|| found.remove(&format!("{prefix}{}", spec.name)));
+            let view = found
+                .remove(&called)
+                .or_else(|| found.remove(&format!("{prefix}{}", spec.name)));
             let WeightSpec {
                 name, shape, role, ..
             } = spec;

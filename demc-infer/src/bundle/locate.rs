@@ -45,11 +45,11 @@ pub(super) fn locate(path: &Path) -> Result<PathBuf, BundleError> {
     if !latest.exists() {
         return Err(BundleError::NoModel { path: path.into() });
     }
-    let checkpoint = fs::read_to_string(&latest).map_err(|source| BundleError::Read {
+    let name = fs::read_to_string(&latest).map_err(|source| BundleError::Read {
         path: latest,
         source,
     })?;
-    let checkpoint = path.join(CHECKPOINTS).join(checkpoint.trim());
+    let checkpoint = path.join(CHECKPOINTS).join(name.trim());
     Ok(checkpoint_weights(&checkpoint).unwrap_or_else(|| checkpoint.join(MODEL)))
 }
 

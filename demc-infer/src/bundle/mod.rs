@@ -90,8 +90,8 @@ impl Bundle {
         if back.meta != self.meta {
             return Some("the header".into());
         }
-        let roles = self.meta.model.weight_specs().into_iter();
-        let roles = roles.map(|spec| spec.role);
+        let specs = self.meta.model.weight_specs().into_iter();
+        let roles = specs.map(|spec| spec.role);
         let mut written: Vec<_> = self.model.weights().into_iter().zip(roles).collect();
         written.sort_by(|(a, _), (b, _)| a.name.cmp(&b.name));
         if written.len() != back.weights.len() {
@@ -157,8 +157,8 @@ impl BundleFile {
             albedo_filter,
             ..
         } = self;
-        let model = meta.model.load(&mut Weights::new(weights), device);
-        let model = model.map_err(|mut source| {
+        let loaded = meta.model.load(&mut Weights::new(weights), device);
+        let model = loaded.map_err(|mut source| {
             match &mut source {
                 WeightsError::Missing { name }
                 | WeightsError::Shape { name, .. }

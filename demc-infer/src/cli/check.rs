@@ -118,7 +118,7 @@ impl Arguments {
         }
         clamped.report();
         let images = all.len();
-        let problems = [
+        let counts = [
             (
                 failed,
                 format!("{failed} of {images} images were not checked"),
@@ -126,8 +126,11 @@ impl Arguments {
             (warned, format!("{warned} of {images} images have warnings")),
             (incomplete, format!("{incomplete} sequence(s) lack frames")),
         ];
-        let problems = problems.into_iter().filter(|(count, _)| *count > 0);
-        let problems: Vec<String> = problems.map(|(_, problem)| problem).collect();
+        let problems: Vec<String> = counts
+            .into_iter()
+            .filter(|(count, _)| *count > 0)
+            .map(|(_, problem)| problem)
+            .collect();
         anyhow::ensure!(problems.is_empty(), "{}", problems.join("; "));
         Ok(())
     }

@@ -91,8 +91,8 @@ impl Arguments {
             let window = check_open_header(&file, &layout, Presence::Skip)?;
             Ok((window.width, window.height))
         };
-        let sizes = self.sizes.iter().map(|size| Ok(*size));
-        let sizes = sizes.chain(self.inputs.iter().map(read_size));
+        let given = self.sizes.iter().map(|size| Ok(*size));
+        let sizes = given.chain(self.inputs.iter().map(read_size));
         let count = self.sizes.len() + self.inputs.len();
         let mut images = Vec::with_capacity(count);
         for size in sizes {
@@ -105,9 +105,10 @@ impl Arguments {
         }
         let failed = count - images.len();
         let config = bundle.model.config();
-        let networks = bundle.networks();
-        let parameters = networks.map(|network| network.meta.model.parameter_count());
-        let parameters = parameters.sum();
+        let parameters = bundle
+            .networks()
+            .map(|network| network.meta.model.parameter_count())
+            .sum();
         let report = CostReport {
             network: *config,
             parameters,

@@ -94,9 +94,11 @@ impl Arguments {
         // Rounding to f16 cannot be undone, so an export must not replace its model.
         let mut outputs = Outputs::default();
         self.model.protect(&mut outputs);
-        let filter = self.albedo_filter.as_deref();
-        let filter = filter.filter(|path| *path != Path::new(NO_FILTER));
-        for file in filter.iter().flat_map(|path| locate::files(path)) {
+        let filter_path = self
+            .albedo_filter
+            .as_deref()
+            .filter(|path| *path != Path::new(NO_FILTER));
+        for file in filter_path.iter().flat_map(|path| locate::files(path)) {
             outputs.protect(&file, "the albedo filter");
         }
         if let Some(layout) = &self.layout {
@@ -107,7 +109,7 @@ impl Arguments {
         }
         check_output(outputs, &self.output)?;
         let file = self.model.read()?;
-        let filter = filter.map(BundleFile::read).transpose()?;
+        let filter = filter_path.map(BundleFile::read).transpose()?;
         let names = match self.names {
             NamesFlag::Burn => Names::Burn,
             NamesFlag::Torch => Names::Torch,

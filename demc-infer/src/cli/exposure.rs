@@ -94,8 +94,10 @@ impl<'a> SequenceScales<'a> {
         let scale = self.scales.entry(index).or_insert_with(|| {
             let samples = self.sequences[index].samples.iter();
             // An unreadable frame is reported when its turn comes.
-            let exposures = samples.filter_map(|path| exposure_of(path, bundle, layouts).ok());
-            let mut exposures: Vec<f64> = exposures.filter(|exposure| *exposure > 0.0).collect();
+            let mut exposures: Vec<f64> = samples
+                .filter_map(|path| exposure_of(path, bundle, layouts).ok())
+                .filter(|exposure| *exposure > 0.0)
+                .collect();
             exposures.sort_by(f64::total_cmp);
             let median = exposures.get(exposures.len() / 2);
             bundle.input_scale(median.copied().unwrap_or(0.0))

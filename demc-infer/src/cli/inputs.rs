@@ -95,9 +95,9 @@ impl Inputs {
         for after in after.filter_map(|sequence| sequence.after.as_ref()) {
             message::say(format_args!("note: {after}"));
         }
-        let missing = self.sequences.iter();
-        let missing = missing.filter_map(|sequence| sequence.missing.as_ref());
-        missing
+        self.sequences
+            .iter()
+            .filter_map(|sequence| sequence.missing.as_ref())
             .inspect(|missing| message::say(format_args!("error: {missing}")))
             .count()
     }
@@ -180,8 +180,11 @@ impl<'a> SequencePattern<'a> {
             .filter_map(|path| Some((self.number(path.file_name()?.to_str()?)?, path)))
             .collect();
         found.sort();
-        let samples = found.iter().step_by(found.len().div_ceil(SAMPLES).max(1));
-        let samples = samples.map(|(_, path)| path.clone()).collect();
+        let samples = found
+            .iter()
+            .step_by(found.len().div_ceil(SAMPLES).max(1))
+            .map(|(_, path)| path.clone())
+            .collect();
         let numbers: Vec<u64> = found.iter().map(|(number, _)| *number).collect();
         let (mut missing, mut after) = (None, None);
         if let (Some(&first), Some(&last)) = (numbers.first(), numbers.last()) {

@@ -76,7 +76,7 @@ pub fn read_layers(
         return Ok((Vec::new(), 0));
     }
     let (planes, repaired) = decode_layers(file, layout, names, repair)?;
-    let layers = names.iter().cloned().zip(planes);
-    let layers = layers.map(|(name, samples)| Layer { name, samples });
+    let named = names.iter().cloned().zip(planes);
+    let layers = named.map(|(name, samples)| Layer { name, samples });
     Ok((layers.collect(), repaired))
 }

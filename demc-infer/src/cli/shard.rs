@@ -36,10 +36,10 @@ impl Shard {
     pub fn keep<T, Name: Ord>(self, items: &mut Vec<T>, name: impl Fn(&T) -> Name) {
         let mut by_name: Vec<usize> = (0..items.len()).collect();
         by_name.sort_by_key(|item| name(&items[*item]));
-        let mut kept = vec![false; items.len()];
+        let mut is_own = vec![false; items.len()];
         let own = by_name.into_iter().skip(self.index - 1).step_by(self.count);
-        own.for_each(|item| kept[item] = true);
-        let mut kept = kept.into_iter();
+        own.for_each(|item| is_own[item] = true);
+        let mut kept = is_own.into_iter();
         items.retain(|_| kept.next().unwrap_or(false));
     }
 }

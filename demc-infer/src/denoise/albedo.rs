@@ -61,11 +61,12 @@ impl FrameInput<'_> {
             // The filter takes the positions of the network ([`BundleMeta::filter_problem`]).
             ..FrameInput::with_positions(filter, frame, self.positions)?
         };
-        let tiles = filter.tiles(frame.height, frame.width, &tiling.exact(), Ensemble::One);
-        let tiles = tiles.map_err(|source| DenoiseError::Memory {
-            name: frame.name.clone(),
-            source,
-        })?;
+        let tiles = filter
+            .tiles(frame.height, frame.width, &tiling.exact(), Ensemble::One)
+            .map_err(|source| DenoiseError::Memory {
+                name: frame.name.clone(),
+                source,
+            })?;
         let mut filtered = own.denoise_into(size, &tiles, &mut |progress| {
             let share = 0.0;
             observer(DenoiseProgress { share, ..progress })

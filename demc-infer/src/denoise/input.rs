@@ -281,8 +281,8 @@ impl<'a> FrameInput<'a> {
     }
 
     fn features(&self, rows: &PixelRange, columns: &PixelRange) -> Vec<f32> {
-        let features = &self.frame.features;
-        let mut features = self.padding.cut(features, rows.clone(), columns.clone());
+        let whole = &self.frame.features;
+        let mut features = self.padding.cut(whole, rows.clone(), columns.clone());
         if let Some(albedo) = &self.albedo {
             let albedo = self.padded().cut(albedo, rows.clone(), columns.clone());
             let first = TEXTURES * rows.len() * columns.len();

@@ -40,12 +40,14 @@ pub(super) fn factors(noisy: &[f32], denoised: &[f32], height: usize, width: usi
     if pixels == 0 {
         return factors;
     }
-    let planes = factors.par_chunks_mut(pixels);
-    let planes = planes.zip(noisy.par_chunks(pixels).zip(denoised.par_chunks(pixels)));
-    planes.for_each(|(factors, (noisy, denoised))| {
-        around(noisy, denoised, width, factors);
-        overall(noisy, denoised, width, factors);
-    });
+    let planes = noisy.par_chunks(pixels).zip(denoised.par_chunks(pixels));
+    factors
+        .par_chunks_mut(pixels)
+        .zip(planes)
+        .for_each(|(factors, (noisy, denoised))| {
+            around(noisy, denoised, width, factors);
+            overall(noisy, denoised, width, factors);
+        });
     factors
 }
 
@@ -90,10 +92,11 @@ fn around(noisy: &[f32], denoised: &[f32], width: usize, factors: &mut [f32]) {
 
 /// Multiplies the factors of one plane by those from the means of the whole image.
 fn overall(noisy: &[f32], denoised: &[f32], width: usize, factors: &mut [f32]) {
-    let lines = noisy.par_chunks(width).zip(denoised.par_chunks(width));
-    let lines = lines.zip(factors.par_chunks(width));
     // In a fixed order, so that threads change no bit.
-    let lines: Vec<Sums> = lines
+    let lines: Vec<Sums> = noisy
+        .par_chunks(width)
+        .zip(denoised.par_chunks(width))
+        .zip(factors.par_chunks(width))
         .map(|((noisy, denoised), factors)| {
             let mut sums = Sums::default();
             for ((noisy, denoised), factor) in noisy.iter().zip(denoised).zip(factors) {
@@ -126,8 +129,7 @@ struct Neighbours {
 
 impl Neighbours {
     fn of(pixel: usize, blocks: usize) -> Self {
-        let position = (pixel as f32 + 0.5) / BLOCK as f32 - 0.5;
-        let position = position.clamp(0.0, (blocks - 1) as f32);
+        let position = ((pixel as f32 + 0.5) / BLOCK as f32 - 0.5).clamp(0.0, (blocks - 1) as f32);
         let first = position as usize;
         Self {
             blocks: [first, (first + 1).min(blocks - 1)],

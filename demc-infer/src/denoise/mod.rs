@@ -113,12 +113,12 @@ impl Bundle {
         let ensemble = *ensemble;
         let pixels = frame.width * frame.height;
         if !layers.is_empty() {
-            let checked = self.check_layers(ensemble);
-            let checked = checked.and_then(|()| check_layer_sizes(layers, pixels));
-            checked.map_err(|source| DenoiseError::Layers {
-                name: frame.name.clone(),
-                source,
-            })?;
+            self.check_layers(ensemble)
+                .and_then(|()| check_layer_sizes(layers, pixels))
+                .map_err(|source| DenoiseError::Layers {
+                    name: frame.name.clone(),
+                    source,
+                })?;
         }
         let scale = || match input_scale {
             Some(scale) => *scale,
@@ -284,9 +284,10 @@ impl Bundle {
         let mut input = FrameInput::new(self, frame)?;
         input.filter_albedo(&Tiling::default(), &mut unobserved)?;
         let (height, width) = (input.padding.padded_height(), input.padding.padded_width());
-        let map = self.model.detail_map(input.features_z(0..height, 0..width));
-        let map = map.map(|map| input.read(map)).transpose()?;
-        Ok(map.map(|map| input.padding.crop(&map)))
+        self.model
+            .detail_map(input.features_z(0..height, 0..width))
+            .map(|map| Ok(input.padding.crop(&input.read(map)?)))
+            .transpose()
     }
 
     pub(crate) fn device(&self) -> Device {

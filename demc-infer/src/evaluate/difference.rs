@@ -33,9 +33,11 @@ impl Report {
     /// Differences between the denoised image and the noisy one and each baseline, in every metric
     /// that both have on at least two images.
     pub fn differences(&self) -> Vec<Difference> {
-        let others = self.mean.methods().into_iter().map(|(name, _)| name);
-        let others = others.filter(|name| !matches!(*name, "black" | "denoised"));
-        others
+        self.mean
+            .methods()
+            .into_iter()
+            .map(|(name, _)| name)
+            .filter(|name| !matches!(*name, "black" | "denoised"))
             .flat_map(|against| METRICS.iter().map(move |metric| (against, metric)))
             .filter_map(|(against, metric)| {
                 let value = |score: &Score| {

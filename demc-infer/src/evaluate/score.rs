@@ -38,10 +38,10 @@ impl Score {
     pub fn full(candidate: &Image, reference: &Image) -> Self {
         candidate.prepare();
         reference.prepare();
-        let values = METRICS
+        let values: Vec<Option<f64>> = METRICS
             .par_iter()
-            .map(|m| (m.measure)(candidate, reference));
-        let values: Vec<Option<f64>> = values.collect();
+            .map(|metric| (metric.measure)(candidate, reference))
+            .collect();
         let mut others: BTreeMap<String, Option<f64>> = METRICS
             .iter()
             .zip(values)
@@ -263,18 +263,18 @@ pub struct Report {
 impl Report {
     /// The report on these images, which have the same baselines.
     pub fn new(images: Vec<ImageScore>) -> Self {
-        let mean = |score: &dyn Fn(&ImageScore) -> Option<&Score>| {
+        let mean_of = |score: &dyn Fn(&ImageScore) -> Option<&Score>| {
             Score::mean(&images.iter().filter_map(score).collect::<Vec<_>>())
         };
-        let baselines = images.first().map(|image| image.baselines.keys());
-        let baselines = baselines.into_iter().flatten().map(|name| {
-            let mean = mean(&|image| image.baselines.get(name));
+        let names = images.first().map(|image| image.baselines.keys());
+        let baselines = names.into_iter().flatten().map(|name| {
+            let mean = mean_of(&|image| image.baselines.get(name));
             (name.clone(), mean)
         });
         let mean = MeanScore {
-            noisy: mean(&|image| Some(&image.noisy)),
-            black: mean(&|image| Some(&image.black)),
-            denoised: mean(&|image| Some(&image.denoised)),
+            noisy: mean_of(&|image| Some(&image.noisy)),
+            black: mean_of(&|image| Some(&image.black)),
+            denoised: mean_of(&|image| Some(&image.denoised)),
             baselines: baselines.collect(),
         };
         Self {

@@ -24,8 +24,8 @@ impl Report {
         rows.push(row("mean", &metrics, &methods, None));
         let mut text = format!("{}\n{}", aligned(&rows), legend(&metrics));
         if !self.failed.is_empty() {
-            let names = self.failed.iter().map(|image| printable(&image.name));
-            let names = list(&names.collect::<Vec<_>>());
+            let failed = self.failed.iter().map(|image| printable(&image.name));
+            let names = list(&failed.collect::<Vec<_>>());
             text += &format!("\nNot scored, and not part of the means: {names}.");
         }
         text
@@ -90,11 +90,11 @@ fn escaped(name: &str) -> String {
 fn aligned(rows: &[Vec<String>]) -> String {
     let width = |column: usize| rows.iter().map(|r| r[column].chars().count()).max();
     let widths: Vec<usize> = (0..rows[0].len()).filter_map(width).collect();
-    let rule = widths.iter().enumerate().map(|(i, &width)| match i {
+    let dashes = |(i, &width): (usize, &usize)| match i {
         0 => "-".repeat(width),
         _ => "-".repeat(width - 1) + ":",
-    });
-    let rule: Vec<String> = rule.collect();
+    };
+    let rule: Vec<String> = widths.iter().enumerate().map(dashes).collect();
     let mut out = String::new();
     for cells in rows[..1].iter().chain([&rule]).chain(&rows[1..]) {
         for (i, (cell, width)) in cells.iter().zip(&widths).enumerate() {
@@ -112,13 +112,13 @@ fn legend(metrics: &[&Metric]) -> String {
     let headlines = "RelMSE: Eq. 5, summed over rgb, linear HDR, smaller is better. \
          SSIM: Wang et al. 2004 on clip(x, 0, 1)^(1/2.2), larger is better.";
     let others = metrics.iter().filter(|metric| !is_headline(metric.name));
-    let others = others.map(|metric| {
+    let lines = others.map(|metric| {
         let Metric {
             name, definition, ..
         } = metric;
         format!("\n{name}: {definition}; best {}.", metric.better.phrase())
     });
-    headlines.to_owned() + &others.collect::<String>()
+    headlines.to_owned() + &lines.collect::<String>()
 }
 
 #[cfg(test)]

@@ -67,10 +67,10 @@ impl Bundle {
     pub fn check_statistics(&self, frame: &Frame) -> Result<(), DenoiseError> {
         check_sizes(frame)?;
         let stats = &self.meta.normalizer.features;
-        let planes = frame.features.chunks_exact(frame.height * frame.width);
+        let pixels = frame.height * frame.width;
+        let planes = frame.features.chunks_exact(pixels).enumerate();
         // Mapped positions cannot be far.
         let mapped = !self.meta.normalizer.position.is_scene();
-        let planes = planes.enumerate();
         for (i, plane) in planes.filter(|(i, _)| !(mapped && (POSITIONS..TEXTURES).contains(i))) {
             let mask = frame.mask.as_deref().filter(|_| i < GEOMETRY);
             let (mean, std) = (stats.mean[i], stats.std[i]);

@@ -24,9 +24,8 @@ pub(super) fn with_filter(
     let mut before = GraphBuilder::new(precision, Vec::new());
     let end = TEXTURES + COLOR_CHANNELS;
     let albedo = before.channels(&named("albedo"), &features, TEXTURES..end);
-    let bounds = [("lowest", 0.0), ("highest", MAX_ALBEDO)];
-    let bounds = bounds.map(|(name, value)| before.constant(&named(name), &[], &[value]));
-    let [low, high] = &bounds;
+    let [low, high] = &[("lowest", 0.0), ("highest", MAX_ALBEDO)]
+        .map(|(name, value)| before.constant(&named(name), &[], &[value]));
     before.node("Clip", &named(COLOR), &[&albedo, low, high], &[]);
     let before = before.finish();
 
@@ -37,19 +36,14 @@ pub(super) fn with_filter(
     // Pixels with albedo 0, which have no surface, keep it.
     let brightest = after.node("ReduceMax", &named("brightest"), &[&albedo], &over(&[1]));
     let surface = after.node("Greater", &named("surface"), &[&brightest, low], &[]);
-    let clipped = after.node("Where", &named("kept"), &[&surface, &clipped, low], &[]);
+    let kept = after.node("Where", &named("kept"), &[&surface, &clipped, low], &[]);
     // Whether any channel varies over the image.
     let most = after.node("ReduceMax", &named("most"), &[&albedo], &over(&[2, 3]));
     let least = after.node("ReduceMin", &named("least"), &[&albedo], &over(&[2, 3]));
     let span = after.node("Sub", &named("span"), &[&most, &least], &[]);
     let widest = after.node("ReduceMax", &named("widest"), &[&span], &over(&[1]));
     let varies = after.node("Greater", &named("varies"), &[&widest, low], &[]);
-    let chosen = after.node(
-        "Where",
-        &named("chosen"),
-        &[&varies, &clipped, &albedo],
-        &[],
-    );
+    let chosen = after.node("Where", &named("chosen"), &[&varies, &kept, &albedo], &[]);
     let geometry = after.channels(&named("geometry"), &features, 0..TEXTURES);
     let second = after.channels(&named("albedo2"), &features, end..FEATURE_CHANNELS);
     let parts = [&geometry, &chosen, &second];
@@ -84,12 +78,13 @@ fn named(name: &str) -> String {
 /// Renames the nodes, values and constants of a graph.
 fn rename(graph: &mut GraphProto, name: impl Fn(&str) -> String) {
     for node in &mut graph.node {
-        let values = node.input.iter_mut().chain(&mut node.output);
         // An optional input that is absent has an empty name.
-        let values = values
+        node.input
+            .iter_mut()
+            .chain(&mut node.output)
             .chain([&mut node.name])
-            .filter(|value| !value.is_empty());
-        values.for_each(|value| *value = name(value));
+            .filter(|value| !value.is_empty())
+            .for_each(|value| *value = name(value));
     }
     for constant in &mut graph.initializer {
         constant.name = name(&constant.name);

@@ -49,11 +49,11 @@ impl GraphBuilder {
         let darkest = self.constant("kernels.darkest", &[], &[DARKEST]);
         let visible = self.node("Greater", "kernels.visible", &[&out, &darkest], &[]);
         let target = [("to", AttributeValue::Int(1))];
-        let visible = self.node("Cast", "kernels.visible.f32", &[&visible], &target);
+        let factor = self.node("Cast", "kernels.visible.f32", &[&visible], &target);
         let bright = self.node("Max", "kernels.bright", &[&out, &darkest], &[]);
         let exponent = self.constant("kernels.inverse_gamma", &[], &[1.0 / GAMMA]);
         let power = self.node("Pow", "kernels.power", &[&bright, &exponent], &[]);
-        self.node("Mul", "output_gamma", &[&power, &visible], &[])
+        self.node("Mul", "output_gamma", &[&power, &factor], &[])
     }
 
     /// One-hot kernels `[75, 1, 5, 5]`: the 25 neighbours of each channel.
@@ -70,7 +70,7 @@ impl GraphBuilder {
     fn filtered(&mut self, level: usize, image: &Value, weights: &Value, taps: &Value) -> Value {
         let name = |what: &str| format!("kernels.{what}.{level}");
         let axis = [("axis", AttributeValue::Int(1))];
-        let weights = self.node("Softmax", &name("softmax"), &[weights], &axis);
+        let shares = self.node("Softmax", &name("softmax"), &[weights], &axis);
         let reach = (SIDE / 2) as i64;
         let pads = self.integers(&name("pads"), &[0, 0, reach, reach, 0, 0, reach, reach]);
         let edge = [("mode", AttributeValue::Text("edge"))];
@@ -83,9 +83,9 @@ impl GraphBuilder {
         let taps = KERNEL_LOGITS as i64;
         let [colors, one] = [("color_shape", COLOR_CHANNELS as i64), ("weight_shape", 1)]
             .map(|(what, first)| self.integers(&name(what), &[0, first, taps, -1]));
-        let gathered = self.node("Reshape", &name("taps"), &[&gathered, &colors], &[]);
-        let weights = self.node("Reshape", &name("kernel"), &[&weights, &one], &[]);
-        let products = self.node("Mul", &name("products"), &[&gathered, &weights], &[]);
+        let values = self.node("Reshape", &name("taps"), &[&gathered, &colors], &[]);
+        let kernel = self.node("Reshape", &name("kernel"), &[&shares, &one], &[]);
+        let products = self.node("Mul", &name("products"), &[&values, &kernel], &[]);
         let axes = self.integers(&name("axes"), &[2]);
         let flat = [("keepdims", AttributeValue::Int(0))];
         let sum = self.node("ReduceSum", &name("sum"), &[&products, &axes], &flat);

@@ -82,9 +82,9 @@ impl GraphBuilder {
 
     /// The features with albedo of at most [`MAX_ALBEDO`].
     fn albedo_clamped(&mut self) -> Value {
-        let mut most = [f32::MAX; FEATURE_CHANNELS];
-        most[TEXTURES..].fill(MAX_ALBEDO);
-        let most = self.constant("features_max", &[1, FEATURE_CHANNELS, 1, 1], &most);
+        let mut limits = [f32::MAX; FEATURE_CHANNELS];
+        limits[TEXTURES..].fill(MAX_ALBEDO);
+        let most = self.constant("features_max", &[1, FEATURE_CHANNELS, 1, 1], &limits);
         let raw = Value(FEATURES.into());
         self.node("Min", "features_clamped", &[&raw, &most], &[])
     }
@@ -160,8 +160,8 @@ impl GraphBuilder {
 
     /// Adds a level of the decoder: `[decoder | skips]`, fused (Eq. 2).
     fn ascend(&mut self, x: &Value, skips: Vec<Value>, level: &DecoderLevel) -> Value {
-        let decoded = self.deconv(x, &level.deconv, level.norm.as_ref());
-        let decoded = self.relu(&decoded);
+        let upsampled = self.deconv(x, &level.deconv, level.norm.as_ref());
+        let decoded = self.relu(&upsampled);
         let parts: Vec<&Value> = std::iter::once(&decoded).chain(&skips).collect();
         let all = self.concat(&format!("{}.concat", decoded.0), &parts);
         let fused = self.conv(&all, &level.fuse, None);
@@ -227,12 +227,12 @@ impl GraphBuilder {
         let weight = match (self.precision(), norm) {
             (Precision::F16, Some(norm)) => {
                 let plain = self.kernel(name, &spec.shape, plain.weight());
-                let scale = norm_scale(norm);
-                let scale_shape = match spec.role {
-                    Role::Deconvolution => [1, scale.len(), 1, 1],
-                    _ => [scale.len(), 1, 1, 1],
+                let factors = norm_scale(norm);
+                let shape = match spec.role {
+                    Role::Deconvolution => [1, factors.len(), 1, 1],
+                    _ => [factors.len(), 1, 1, 1],
                 };
-                let scale = self.constant(&format!("{path}.scale"), &scale_shape, &scale);
+                let scale = self.constant(&format!("{path}.scale"), &shape, &factors);
                 self.node("Mul", &format!("{name}.scaled"), &[&plain, &scale], &[])
             }
             _ => self.kernel(name, &spec.shape, folded.weight()),

@@ -106,11 +106,14 @@ impl SceneImages<'_> {
     /// The reference is missing, a value is not finite, or an image is too large for JPEG.
     pub fn encode(&self, scenes: usize) -> Result<EncodedScene, ReportError> {
         let reference = reference_of(self.frame)?;
-        let maps = self.candidates().into_par_iter().map(|(name, planes)| {
-            let candidate = image_of(self.frame, name, planes)?;
-            Ok((name, ErrorMap::new(&candidate, &reference)))
-        });
-        let maps: Vec<(&str, ErrorMap)> = maps.collect::<Result<_, DenoiseError>>()?;
+        let maps: Vec<(&str, ErrorMap)> = self
+            .candidates()
+            .into_par_iter()
+            .map(|(name, planes)| {
+                let candidate = image_of(self.frame, name, planes)?;
+                Ok((name, ErrorMap::new(&candidate, &reference)))
+            })
+            .collect::<Result<_, DenoiseError>>()?;
         let encoded = self.encode_all(reference.hdr(), &maps, BUDGET / scenes.max(1));
         encoded.map_err(|source| ReportError::Encoding {
             name: self.frame.name.clone(),
@@ -216,10 +219,10 @@ impl ByteBudget {
     ) -> Result<Urls, EncodingError> {
         let budget = self.left * shares / self.shares.max(1);
         self.shares -= shares * pictures.len();
-        let encoded = pictures
+        let encoded: Vec<(String, Jpeg)> = pictures
             .into_par_iter()
-            .map(|(name, pixels)| Ok((name, pixels.jpeg_within(budget)?)));
-        let encoded: Vec<(String, Jpeg)> = encoded.collect::<Result<_, EncodingError>>()?;
+            .map(|(name, pixels)| Ok((name, pixels.jpeg_within(budget)?)))
+            .collect::<Result<_, EncodingError>>()?;
         for (_, jpeg) in &encoded {
             self.left = self.left.saturating_sub(jpeg.len());
             let [worst, best] = self.quality;
