@@ -95,7 +95,7 @@ struct ControlGroup {
 impl ControlGroup {
     /// Available bytes below its limit; `None` without a limit.
     fn available(&self) -> Option<u64> {
-        let [limit, usage, caches] = self.names;
+        let [limit_name, usage_name, caches_name] = self.names;
         let number = |name| {
             fs::read_to_string(self.folder.join(name))
                 .ok()?
@@ -104,9 +104,9 @@ impl ControlGroup {
                 .ok()
         };
         // Without a limit, the file holds `max`.
-        let limit: u64 = number(limit)?;
-        let used: u64 = number(usage)?;
-        let caches = value(&self.folder.join("memory.stat"), caches).unwrap_or(0);
+        let limit: u64 = number(limit_name)?;
+        let used: u64 = number(usage_name)?;
+        let caches = value(&self.folder.join("memory.stat"), caches_name).unwrap_or(0);
         Some(limit.saturating_sub(used.saturating_sub(caches)))
     }
 }

@@ -145,10 +145,10 @@ fn axis_permutations_are_the_same_for_normals_and_positions() {
         };
         let way: Vec<(usize, bool)> = (3..6)
             .map(|plane| {
-                let all = (0..3).flat_map(|from| [(from, false), (from, true)]);
-                let mut all =
-                    all.filter(|(from, turned)| is(&after[plane], &before[3 + from], *turned));
-                all.next().expect("it is one of the axes")
+                (0..3)
+                    .flat_map(|from| [(from, false), (from, true)])
+                    .find(|(from, turned)| is(&after[plane], &before[3 + from], *turned))
+                    .expect("it is one of the axes")
             })
             .collect();
         for (normal, (from, turned)) in way.iter().enumerate() {

@@ -173,8 +173,9 @@ fn index_finds_scenes_splits_and_bases() {
     assert!(text.contains(expected), "{text}");
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
     let set = Dataset::open(dir.0.path(), &layout).expect("a data set");
-    let rows = set.scenes.iter();
-    let rows: Vec<_> = rows
+    let rows: Vec<_> = set
+        .scenes
+        .iter()
         .map(|scene| {
             (
                 scene.name.as_str(),
@@ -266,9 +267,11 @@ fn index_refuses_unusable_sets_and_writes_nothing() {
     refused(&["index", &root], 1, "no preset fits");
     refused(&["index", &root, "--layout", "fbksd"], 1, "COLOR_R");
 
-    let channels = scene_channels(4, 2).into_iter();
-    let channels = channels.filter(|(name, _)| !name.starts_with("ref"));
-    write(&dir.path("plain.exr"), (4, 2), channels.collect());
+    let channels = scene_channels(4, 2)
+        .into_iter()
+        .filter(|(name, _)| !name.starts_with("ref"))
+        .collect();
+    write(&dir.path("plain.exr"), (4, 2), channels);
     refused(
         &["index", &root],
         1,

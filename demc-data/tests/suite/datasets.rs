@@ -96,8 +96,7 @@ fn the_manifests_order_does_not_change_what_is_held_out() {
         .train_validation(0.3, 5)
         .expect("scenes")
         .1;
-    let backward = scenes.into_iter().rev().collect();
-    let backward = dataset(dir.path(), backward)
+    let backward = dataset(dir.path(), scenes.into_iter().rev().collect())
         .expect("sound")
         .train_validation(0.3, 5)
         .expect("scenes")

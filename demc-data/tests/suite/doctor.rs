@@ -26,14 +26,16 @@ fn planes(name: &str) -> Planes {
     let names: Vec<String> = file.channels().iter().map(|c| c.name.clone()).collect();
     let read: Vec<&str> = names.iter().map(String::as_str).collect();
     let planes = file.read(&read).expect("sound");
-    let planes = planes.iter().map(|plane| plane.to_f32());
-    names.iter().cloned().zip(planes).collect()
+    let samples = planes.iter().map(|plane| plane.to_f32());
+    names.iter().cloned().zip(samples).collect()
 }
 
 fn save(path: &Path, planes: Planes) {
-    let channels = planes.into_iter();
-    let channels = channels.map(|(name, samples)| (name, FlatSamples::F32(samples)));
-    write(path, (SIDE, SIDE), channels.collect());
+    let channels = planes
+        .into_iter()
+        .map(|(name, samples)| (name, FlatSamples::F32(samples)))
+        .collect();
+    write(path, (SIDE, SIDE), channels);
 }
 
 fn entry(name: &str, split: &str) -> Value {

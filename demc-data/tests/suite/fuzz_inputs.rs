@@ -14,8 +14,8 @@ fn inputs(target: &str) -> Vec<PathBuf> {
     let dir = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../tests/fuzz")
         .join(target);
-    let files = fs::read_dir(&dir).unwrap_or_else(|error| panic!("{}: {error}", dir.display()));
-    let mut files: Vec<_> = files.map(|file| file.expect("readable").path()).collect();
+    let entries = fs::read_dir(&dir).unwrap_or_else(|error| panic!("{}: {error}", dir.display()));
+    let mut files: Vec<_> = entries.map(|file| file.expect("readable").path()).collect();
     files.sort();
     files
 }
@@ -112,16 +112,17 @@ fn every_finding_in_a_layout_is_valid_or_gives_one_error_line() {
 fn every_seed_of_a_manifest_opens() {
     let dir = tempfile::tempdir().expect("directory");
     fs::create_dir(dir.path().join("sub")).expect("writable");
-    let mut images = inputs("seeds/exr").into_iter();
-    let image = images.find(|path| path.ends_with("none.exr"));
-    let image = image.expect("a seed");
+    let image = inputs("seeds/exr")
+        .into_iter()
+        .find(|path| path.ends_with("none.exr"))
+        .expect("a seed");
     for name in ["a.exr", "b.exr", "sub/c.exr"] {
         fs::copy(&image, dir.path().join(name)).expect("copied");
     }
     for seed in inputs("seeds/manifest") {
         fs::copy(&seed, dir.path().join("manifest.json")).expect("copied");
-        let set = Dataset::open(dir.path(), &layout());
-        let set = set.unwrap_or_else(|error| panic!("{}: {error}", seed.display()));
+        let set = Dataset::open(dir.path(), &layout())
+            .unwrap_or_else(|error| panic!("{}: {error}", seed.display()));
         assert_eq!(set.scenes.len(), 3, "{}", seed.display());
     }
 }

@@ -48,13 +48,15 @@ impl Files {
 
     /// Checks that the files are refused with `message`, and that nothing is written.
     fn refused(&self, files: &[(Option<&str>, &Path)], message: &str) {
-        let error = joined(&self.path("out.exr"), files).expect_err("a refusal");
-        let error = error.to_string();
+        let error = joined(&self.path("out.exr"), files)
+            .expect_err("a refusal")
+            .to_string();
         assert!(error.contains(message), "{error}, not {message}");
         assert!(!error.contains('\n'), "{error}");
-        let names = fs::read_dir(self.0.path()).expect("readable");
-        let names = names.map(|entry| entry.expect("readable").file_name());
-        let mut names = names.map(|name| name.to_string_lossy().into_owned());
+        let mut names = fs::read_dir(self.0.path())
+            .expect("readable")
+            .map(|entry| entry.expect("readable").file_name())
+            .map(|name| name.to_string_lossy().into_owned());
         assert!(
             names.all(|name| !name.contains("out")),
             "something is written"
@@ -266,8 +268,8 @@ fn a_file_without_channels_is_refused() {
     // The crate writes no file without channels, so the list is cut from the header.
     let bytes = fs::read(&path).expect("readable");
     let list = b"channels\0chlist\0";
-    let start = bytes.windows(list.len()).position(|w| w == list);
-    let start = start.expect("a list") + list.len();
+    let found = bytes.windows(list.len()).position(|w| w == list);
+    let start = found.expect("a list") + list.len();
     let size = u32::from_le_bytes(bytes[start..start + 4].try_into().expect("four bytes"));
     let end = start + 4 + size as usize;
     let empty = [1, 0, 0, 0, 0];

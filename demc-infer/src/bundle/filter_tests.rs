@@ -33,13 +33,15 @@ fn refusal(bytes: &[u8], without: &str, change: impl Fn(&mut serde_json::Value))
     let mut header = entry(bytes);
     change(&mut header);
     let tensors = SafeTensors::deserialize(bytes).expect("tensors");
-    let tensors = tensors.tensors().into_iter();
-    let tensors = tensors.filter(|(name, _)| name != without);
+    let kept = tensors
+        .tensors()
+        .into_iter()
+        .filter(|(name, _)| name != without);
     let metadata = std::collections::HashMap::from([("demc".into(), header.to_string())]);
-    let bytes = safetensors::serialize(tensors, Some(metadata)).expect("bytes");
-    let file = BundleFile::parse("x".into(), &bytes);
-    let error = file.and_then(|file| file.into_bundle(&flex()));
-    let error = error.expect_err("refused");
+    let bytes = safetensors::serialize(kept, Some(metadata)).expect("bytes");
+    let error = BundleFile::parse("x".into(), &bytes)
+        .and_then(|file| file.into_bundle(&flex()))
+        .expect_err("refused");
     let source = std::error::Error::source(&error).map(|source| format!(": {source}"));
     format!("{error}{}", source.unwrap_or_default())
 }
@@ -92,8 +94,8 @@ fn the_network_is_written_as_without_a_filter() {
     let filter = filter.expect("the filter's entry");
     assert_eq!(filter["step"], 77);
     assert!(filter.get("names").is_none() && filter.get("albedo_filter").is_none());
-    let [plain, whole] = [&plain, &whole].map(|bytes| SafeTensors::deserialize(bytes));
-    let (plain, whole) = (plain.expect("tensors"), whole.expect("tensors"));
+    let [plain, whole] =
+        [&plain, &whole].map(|bytes| SafeTensors::deserialize(bytes).expect("tensors"));
     assert_eq!(whole.len(), 2 * plain.len());
     for (name, view) in plain.tensors() {
         assert_eq!(

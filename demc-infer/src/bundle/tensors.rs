@@ -28,8 +28,8 @@ pub(super) fn serialize(
         let view = TensorView::new(tensor.dtype, tensor.shape.clone(), &tensor.bytes)?;
         Ok((tensor.name.as_str(), view))
     });
-    let views: Result<Vec<_>, safetensors::SafeTensorError> = views.collect();
     views
+        .collect::<Result<Vec<_>, safetensors::SafeTensorError>>()
         .and_then(|views| safetensors::serialize(views, metadata))
         .map_err(|error| error.to_string())
 }

@@ -58,8 +58,8 @@ fn good() -> (TensorList, String) {
     let bytes = encoded(&bundle, Names::Burn, Precision::F32);
     let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).expect("header");
     let entry = header.metadata().as_ref().expect("metadata")["demc"].clone();
-    let tensors = safetensors::SafeTensors::deserialize(&bytes).expect("tensors");
-    let tensors = tensors.tensors().into_iter().map(|(name, view)| {
+    let file = safetensors::SafeTensors::deserialize(&bytes).expect("tensors");
+    let tensors = file.tensors().into_iter().map(|(name, view)| {
         (
             name,
             view.dtype(),

@@ -62,8 +62,8 @@ fn around(noisy: &[f32], denoised: &[f32], width: usize, factors: &mut [f32]) {
     let height = noisy.len() / width;
     let grid = [height.div_ceil(BLOCK), width.div_ceil(BLOCK)];
     let mut blocks = vec![Sums::default(); grid[0] * grid[1]];
-    let rows = blocks.par_chunks_mut(grid[1]).enumerate();
-    rows.for_each(|(row, blocks)| {
+    let rows_of_blocks = blocks.par_chunks_mut(grid[1]).enumerate();
+    rows_of_blocks.for_each(|(row, blocks)| {
         let pixels = row * BLOCK * width..((row + 1) * BLOCK).min(height) * width;
         let lines = noisy[pixels.clone()].chunks(width);
         for (noisy, denoised) in lines.zip(denoised[pixels].chunks(width)) {

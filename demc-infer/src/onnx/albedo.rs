@@ -59,10 +59,9 @@ pub(super) fn with_filter(
         FEATURES => whole.0.clone(),
         _ => name.into(),
     });
-    let parts = [before, filter, after, network];
-    let (node, initializer) = parts
+    let (node, initializer) = [before, filter, after, network]
         .into_iter()
-        .map(|part| (part.node, part.initializer))
+        .map(|graph| (graph.node, graph.initializer))
         .unzip::<_, _, Vec<_>, Vec<_>>();
     GraphProto {
         node: node.concat(),

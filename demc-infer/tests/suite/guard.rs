@@ -21,8 +21,7 @@ fn trained() -> (Bundle, Vec<(Split, Frame)>) {
         let frame = read_frame(&scene.path, &layout).expect("sound");
         (scene.split, frame)
     });
-    let frames = frames.collect();
-    (bundle, frames)
+    (bundle, frames.collect())
 }
 
 fn warnings(bundle: &Bundle, frame: &Frame) -> Vec<String> {

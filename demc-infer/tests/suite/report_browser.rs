@@ -29,8 +29,8 @@ fn a_report_works_in_a_browser() {
         "col-dining-room-1",
         "gen-room-test-1",
         "gen-table-test-1",
-    ];
-    let images = images.map(|name| sample_image(&format!("{name}.exr")).into_os_string());
+    ]
+    .map(|name| sample_image(&format!("{name}.exr")).into_os_string());
     let mut list = arguments!["denoise", "-o", others].to_vec();
     list.extend(images);
     demc_infer(list).success();

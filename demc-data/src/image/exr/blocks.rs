@@ -186,8 +186,8 @@ impl<R: Read + Seek> BlockReader<R> {
         let header = &self.meta.headers[part];
         let tiled = matches!(header.blocks, BlockDescription::Tiles(_));
         let lines = header.compression.scan_lines_per_block() * place.tile_index.y();
-        let top = i64::from(header.own_attributes.layer_position.y()) + lines as i64;
-        let top = i32::try_from(top)?;
+        let first = i64::from(header.own_attributes.layer_position.y());
+        let top = i32::try_from(first + lines as i64)?;
         let (tile, level) = (place.tile_index, place.level_index);
         let mut expected = Vec::with_capacity(5);
         expected.extend(several.then_some(part as i64));

@@ -21,9 +21,9 @@ pub fn check_layers<R: Read + Seek>(
     let layout = &*layout.in_file(file, None)?;
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
     file.require(&names)?;
-    let color: &str = &layout.color[0];
-    file.require(&[color])?;
-    let color = file.channel(color);
+    let red: &str = &layout.color[0];
+    file.require(&[red])?;
+    let color = file.channel(red);
     for channel in names.iter().filter_map(|name| file.channel(name)) {
         let refuse = |detail: String| Error::Layer {
             path: file.path().to_owned(),

@@ -108,8 +108,8 @@ fn pixels(headers: &Headers, block: BlockIndex) -> Vec<u8> {
     for y in block.pixel_position.1..block.pixel_position.1 + block.pixel_size.1 {
         for (index, channel) in channels.list.iter().enumerate() {
             for x in block.pixel_position.0..block.pixel_position.0 + block.pixel_size.0 {
-                let value = sample(block.layer, index, (x, y));
-                let value = if small { -1.0 - value } else { value };
+                let full = sample(block.layer, index, (x, y));
+                let value = if small { -1.0 - full } else { full };
                 match channel.sample_type {
                     SampleType::F16 => bytes.extend(f16::from_f32(value).to_bits().to_ne_bytes()),
                     SampleType::F32 => bytes.extend(value.to_ne_bytes()),
