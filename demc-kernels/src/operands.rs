@@ -14,6 +14,17 @@ pub struct Convolution<'a> {
     pub relu: bool,
 }
 
+impl<'a> Convolution<'a> {
+    /// A convolution with a ReLU after it.
+    pub fn rectified(weight: &'a [f32], bias: &'a [f32]) -> Self {
+        Convolution {
+            weight,
+            bias,
+            relu: true,
+        }
+    }
+}
+
 /// What the gradients of a convolution are computed from, beside its inputs.
 ///
 /// # Shapes
@@ -26,6 +37,17 @@ pub struct GradientSource<'a> {
     pub y: Option<&'a [f32]>,
     /// Gradient with respect to the output.
     pub dy: &'a [f32],
+}
+
+impl<'a> GradientSource<'a> {
+    /// For a convolution with a ReLU after it, whose output is `y`.
+    pub fn rectified(weight: &'a [f32], y: &'a [f32], dy: &'a [f32]) -> Self {
+        GradientSource {
+            weight,
+            y: Some(y),
+            dy,
+        }
+    }
 }
 
 /// Where the gradients of a convolution are written. Each has the shape of its value.

@@ -151,19 +151,25 @@ impl Bench {
             let (bias, mut y) = (draw(outputs), draw(pixels * outputs));
             let flops = 18.0 * (pixels * inputs * outputs) as f64;
             let size = format!("{inputs} -> {outputs} at {0} x {0}", PATCH / down);
+            let convolution = Convolution::rectified(&weight, &bias);
             self.run(
                 &format!("conv3x3 forward {size}"),
                 Work::Flops(flops),
-                |isa| conv3x3::forward(isa, grid, &x, rectified(&weight, &bias), &mut y),
+                |isa| conv3x3::forward(isa, grid, &x, convolution, &mut y),
             );
             let dy = draw(pixels * outputs);
             let (mut dx, mut dw, mut db) = (x.clone(), weight.clone(), bias.clone());
+            let source = GradientSource::rectified(&weight, &y, &dy);
             self.run(
                 &format!("conv3x3 backward {size}"),
                 Work::Flops(2.0 * flops),
                 |isa| {
-                    let target = target(Some(&mut dx[..]), &mut dw, &mut db);
-                    conv3x3::backward(isa, grid, &x, source(&weight, &y, &dy), target);
+                    let target = GradientTarget {
+                        dx: Some(&mut dx[..]),
+                        dweight: &mut dw,
+                        dbias: &mut db,
+                    };
+                    conv3x3::backward(isa, grid, &x, source, target);
                 },
             );
         }
@@ -179,21 +185,27 @@ impl Bench {
             let (weight, bias, mut y) = (draw(k * 3 * k), draw(k), draw(pixels * k));
             let flops = 6.0 * (pixels * k * k) as f64;
             let size = format!("3 x {k} -> {k} at {0} x {0}", PATCH >> level);
+            let convolution = Convolution::rectified(&weight, &bias);
             self.run(
                 &format!("conv1x1 forward {size}"),
                 Work::Flops(flops),
-                |isa| conv1x1::forward(isa, grid, &xs, rectified(&weight, &bias), &mut y),
+                |isa| conv1x1::forward(isa, grid, &xs, convolution, &mut y),
             );
             let dy = draw(pixels * k);
             let [mut a, mut b, mut c] = inputs.clone();
             let (mut dw, mut db) = (weight.clone(), bias.clone());
+            let source = GradientSource::rectified(&weight, &y, &dy);
             self.run(
                 &format!("conv1x1 backward {size}"),
                 Work::Flops(2.0 * flops),
                 |isa| {
                     let mut dxs = [Some(&mut a[..]), Some(&mut b[..]), Some(&mut c[..])];
-                    let target = target(&mut dxs[..], &mut dw, &mut db);
-                    conv1x1::backward(isa, grid, &xs, source(&weight, &y, &dy), target);
+                    let target = GradientTarget {
+                        dx: &mut dxs[..],
+                        dweight: &mut dw,
+                        dbias: &mut db,
+                    };
+                    conv1x1::backward(isa, grid, &xs, source, target);
                 },
             );
         }
@@ -212,19 +224,25 @@ impl Bench {
             let (bias, mut y) = (draw(outputs), draw(large * outputs));
             let flops = 32.0 * (small * inputs * outputs) as f64;
             let size = format!("{inputs} -> {outputs} from {0} x {0}", grid.height);
+            let convolution = Convolution::rectified(&weight, &bias);
             self.run(
                 &format!("deconv4x4 forward {size}"),
                 Work::Flops(flops),
-                |isa| deconv4x4::forward(isa, grid, &x, rectified(&weight, &bias), &mut y),
+                |isa| deconv4x4::forward(isa, grid, &x, convolution, &mut y),
             );
             let dy = draw(large * outputs);
             let (mut dx, mut dw, mut db) = (x.clone(), weight.clone(), bias.clone());
+            let source = GradientSource::rectified(&weight, &y, &dy);
             self.run(
                 &format!("deconv4x4 backward {size}"),
                 Work::Flops(2.0 * flops),
                 |isa| {
-                    let target = target(Some(&mut dx[..]), &mut dw, &mut db);
-                    deconv4x4::backward(isa, grid, &x, source(&weight, &y, &dy), target);
+                    let target = GradientTarget {
+                        dx: Some(&mut dx[..]),
+                        dweight: &mut dw,
+                        dbias: &mut db,
+                    };
+                    deconv4x4::backward(isa, grid, &x, source, target);
                 },
             );
         }
@@ -368,24 +386,4 @@ fn draw(len: usize) -> Vec<f32> {
 
 fn bytes(values: usize) -> Work {
     Work::Bytes(4.0 * values as f64)
-}
-
-fn rectified<'a>(weight: &'a [f32], bias: &'a [f32]) -> Convolution<'a> {
-    Convolution {
-        weight,
-        bias,
-        relu: true,
-    }
-}
-
-fn source<'a>(weight: &'a [f32], y: &'a [f32], dy: &'a [f32]) -> GradientSource<'a> {
-    GradientSource {
-        weight,
-        y: Some(y),
-        dy,
-    }
-}
-
-fn target<'a, X>(dx: X, dweight: &'a mut [f32], dbias: &'a mut [f32]) -> GradientTarget<'a, X> {
-    GradientTarget { dx, dweight, dbias }
 }

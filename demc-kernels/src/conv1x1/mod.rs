@@ -43,7 +43,7 @@ pub fn forward(isa: Isa, grid: Grid, xs: &[&[f32]], convolution: Convolution, y:
     );
 }
 
-/// Operations on the sum of [`add_part`].
+/// Operations on the sum of [`forward_part`].
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Epilogue<'a> {
     /// Added to each channel.
@@ -54,7 +54,7 @@ pub struct Epilogue<'a> {
     pub add: bool,
 }
 
-/// A part of a 1x1 convolution, for [`add_part`].
+/// A part of a 1x1 convolution, for [`forward_part`].
 #[derive(Clone, Copy, Debug)]
 pub struct Part<'a> {
     /// Weight of the whole convolution, `[out, in]`.
@@ -76,7 +76,7 @@ pub struct Part<'a> {
 ///
 /// # Panics
 /// If a length does not match the others.
-pub fn add_part(isa: Isa, grid: Grid, xs: &[&[f32]], part: Part, y: &mut [f32]) {
+pub fn forward_part(isa: Isa, grid: Grid, xs: &[&[f32]], part: Part, y: &mut [f32]) {
     let Part {
         weight,
         first,
@@ -173,6 +173,7 @@ pub fn backward(
         grid.pixels(),
     );
 
+    let wide = whole(outputs);
     let (gated, sums) = gated_gradient(isa, y, dy, pixels, outputs);
     for (dbias, sum) in dbias.iter_mut().zip(sums) {
         *dbias = sum as f32;
@@ -190,10 +191,7 @@ pub fn backward(
             .enumerate()
             .for_each(|(o, dweight)| {
                 for (i, dweight) in dweight[first..first + count].iter_mut().enumerate() {
-                    *dweight = products
-                        .iter()
-                        .map(|product| product[i * whole(outputs) + o])
-                        .sum();
+                    *dweight = products.iter().map(|product| product[i * wide + o]).sum();
                 }
             });
     }

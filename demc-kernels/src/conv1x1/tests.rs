@@ -37,7 +37,7 @@ fn parts_added_one_by_one_are_the_whole() {
                 first: 20,
                 epilogue: Epilogue::default(),
             };
-            add_part(isa, grid, &xs[1..], first, &mut y);
+            forward_part(isa, grid, &xs[1..], first, &mut y);
             let last = Part {
                 weight: &weight,
                 first: 0,
@@ -47,7 +47,7 @@ fn parts_added_one_by_one_are_the_whole() {
                     add: true,
                 },
             };
-            add_part(isa, grid, &xs[..1], last, &mut y);
+            forward_part(isa, grid, &xs[..1], last, &mut y);
             let expected = reference::conv1x1(
                 grid,
                 &concatenated(grid, &xs),
@@ -83,11 +83,7 @@ fn equals_the_reference_of_the_concatenation_on_every_path() {
                 let name = format!("{isa} {grid:?} {inputs:?} to {outputs}");
                 let cat = concatenated(grid, &xs);
                 let mut y = vec![f32::NAN; dy.len()];
-                let convolution = Convolution {
-                    weight: &weight,
-                    bias: &bias,
-                    relu: true,
-                };
+                let convolution = Convolution::rectified(&weight, &bias);
                 forward(isa, grid, &xs, convolution, &mut y);
                 let expected = reference::conv1x1(grid, &cat, &f64s(&weight), &f64s(&bias), true);
                 assert_close(&format!("{name} y"), &y, &expected);
@@ -107,11 +103,7 @@ fn equals_the_reference_of_the_concatenation_on_every_path() {
                     isa,
                     grid,
                     &xs,
-                    GradientSource {
-                        weight: &weight,
-                        y: Some(&y),
-                        dy: &dy,
-                    },
+                    GradientSource::rectified(&weight, &y, &dy),
                     GradientTarget {
                         dx: &mut slots[..],
                         dweight: &mut dweight,

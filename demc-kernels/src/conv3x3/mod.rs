@@ -9,7 +9,7 @@ mod thin;
 mod winograd;
 
 use crate::{Convolution, GradientSource, GradientTarget, Grid, Isa};
-use parts::{Axes, BiasRelu};
+use parts::{Axes, BiasRelu, GatedMap};
 
 /// Tiles of the Winograd transforms.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -131,26 +131,17 @@ impl<'a> PreparedConvolution<'a> {
             "an output of {} channels on {grid:?}",
             self.outputs
         );
+        let (x, epilogue) = (GatedMap::open(x, self.inputs), self.epilogue);
         match &self.weights {
             PreparedWeights::Thin(weight) => {
                 let axes = Axes::new(self.outputs, self.inputs, false);
-                thin::convolve(
-                    self.isa,
-                    grid,
-                    x,
-                    None,
-                    above,
-                    weight,
-                    axes,
-                    self.epilogue,
-                    y,
-                );
+                thin::convolve(self.isa, grid, x, above, weight, axes, epilogue, y);
             }
             PreparedWeights::F2(weights) => {
-                winograd::convolve_rows::<4>(grid, x, None, above, weights, self.epilogue, y)
+                winograd::convolve_rows::<4>(grid, x, above, weights, epilogue, y)
             }
             PreparedWeights::F4(weights) => {
-                winograd::convolve_rows::<6>(grid, x, None, above, weights, self.epilogue, y)
+                winograd::convolve_rows::<6>(grid, x, above, weights, epilogue, y)
             }
         }
     }
@@ -173,6 +164,12 @@ pub fn backward(isa: Isa, grid: Grid, x: &[f32], source: GradientSource, target:
     if let Some(dx) = &dx {
         assert_eq!(dx.len(), x.len(), "an input's gradient");
     }
+    let x = GatedMap::open(x, inputs);
+    let dy = GatedMap {
+        map: dy,
+        gate: y,
+        channels: outputs,
+    };
     let nothing = BiasRelu {
         bias: None,
         relu: false,
@@ -181,15 +178,15 @@ pub fn backward(isa: Isa, grid: Grid, x: &[f32], source: GradientSource, target:
         if let Some(dx) = dx {
             let weights =
                 winograd::WinogradWeights::new::<TILE>(isa, weight, outputs, inputs, true);
-            winograd::convolve::<TILE>(grid, dy, y, &weights, nothing, dx);
+            winograd::convolve::<TILE>(grid, dy, &weights, nothing, dx);
         }
-        winograd::gradient::<TILE>(isa, grid, x, dy, y, dweight, dbias);
+        winograd::gradient::<TILE>(isa, grid, x, dy, dweight, dbias);
     } else {
         if let Some(dx) = dx {
             let axes = Axes::new(outputs, inputs, true);
-            thin::convolve(isa, grid, dy, y, 0, weight, axes, nothing, dx);
+            thin::convolve(isa, grid, dy, 0, weight, axes, nothing, dx);
         }
-        thin::gradient(isa, grid, x, dy, y, dweight, dbias);
+        thin::gradient(isa, grid, x, dy, dweight, dbias);
     }
 }
 

@@ -48,6 +48,17 @@ pub(super) struct GatedMap<'a> {
     pub(super) channels: usize,
 }
 
+impl<'a> GatedMap<'a> {
+    /// A map without a gate.
+    pub(super) fn open(map: &'a [f32], channels: usize) -> Self {
+        GatedMap {
+            map,
+            gate: None,
+            channels,
+        }
+    }
+}
+
 #[derive(Clone, Copy)]
 pub(super) struct BiasRelu<'a> {
     pub(super) bias: Option<&'a [f32]>,

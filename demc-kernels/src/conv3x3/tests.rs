@@ -58,11 +58,7 @@ fn bands_of_rows_are_the_whole() {
             let bias = pattern(outputs, 3);
             for tile in [Tile::F2, Tile::F4] {
                 let mut whole = vec![f32::NAN; grid.pixels() * outputs];
-                let convolution = Convolution {
-                    weight: &weight,
-                    bias: &bias,
-                    relu: true,
-                };
+                let convolution = Convolution::rectified(&weight, &bias);
                 let ready = PreparedConvolution::new(isa, tile, convolution);
                 ready.forward(grid, &x, 0, &mut whole);
                 let mut bands = vec![f32::NAN; whole.len()];
@@ -102,8 +98,7 @@ fn larger_tiles_keep_1e_4() {
             let mut y = vec![f32::NAN; grid.pixels() * outputs];
             winograd::convolve::<6>(
                 grid,
-                &x,
-                None,
+                GatedMap::open(&x, inputs),
                 &weights,
                 BiasRelu {
                     bias: Some(&bias),

@@ -19,11 +19,7 @@ fn bands_of_rows_are_the_whole() {
         );
         let bias = pattern(outputs, 3);
         let mut whole = vec![f32::NAN; grid.doubled().pixels() * outputs];
-        let convolution = Convolution {
-            weight: &weight,
-            bias: &bias,
-            relu: true,
-        };
+        let convolution = Convolution::rectified(&weight, &bias);
         forward(isa, grid, &x, convolution, &mut whole);
         let ready = PreparedDeconvolution::new(isa, convolution);
         let mut bands = vec![f32::NAN; whole.len()];

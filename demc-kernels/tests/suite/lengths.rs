@@ -50,26 +50,6 @@ fn checks<const N: usize>(name: &str, lengths: [usize; N], run: impl Fn(Isa, [&m
     }
 }
 
-fn rectified<'a>(weight: &'a [f32], bias: &'a [f32]) -> Convolution<'a> {
-    Convolution {
-        weight,
-        bias,
-        relu: true,
-    }
-}
-
-fn source<'a>(weight: &'a [f32], y: &'a [f32], dy: &'a [f32]) -> GradientSource<'a> {
-    GradientSource {
-        weight,
-        y: Some(y),
-        dy,
-    }
-}
-
-fn target<'a, X>(dx: X, dweight: &'a mut [f32], dbias: &'a mut [f32]) -> GradientTarget<'a, X> {
-    GradientTarget { dx, dweight, dbias }
-}
-
 fn norm<'a>(gamma: &'a [f32], beta: &'a [f32]) -> BatchNorm<'a> {
     BatchNorm {
         gamma,
@@ -89,7 +69,8 @@ fn convolutions() {
                 "conv3x3 forward",
                 [P * i, weight, o, P * o],
                 |isa, [x, w, b, y]| {
-                    PreparedConvolution::new(isa, tile, rectified(w, b)).forward(GRID, x, 0, y);
+                    PreparedConvolution::new(isa, tile, Convolution::rectified(w, b))
+                        .forward(GRID, x, 0, y);
                 },
             );
         }
@@ -97,7 +78,17 @@ fn convolutions() {
             "conv3x3 backward",
             [P * i, weight, P * o, P * o, P * i, weight, o],
             |isa, [x, w, y, dy, dx, dw, db]| {
-                conv3x3::backward(isa, GRID, x, source(w, y, dy), target(Some(dx), dw, db));
+                conv3x3::backward(
+                    isa,
+                    GRID,
+                    x,
+                    GradientSource::rectified(w, y, dy),
+                    GradientTarget {
+                        dx: Some(dx),
+                        dweight: dw,
+                        dbias: db,
+                    },
+                );
             },
         );
     }
@@ -111,14 +102,24 @@ fn deconvolution() {
         "deconv4x4 forward",
         [P * i, weight, o, 4 * P * o],
         |isa, [x, w, b, y]| {
-            deconv4x4::forward(isa, GRID, x, rectified(w, b), y);
+            deconv4x4::forward(isa, GRID, x, Convolution::rectified(w, b), y);
         },
     );
     checks(
         "deconv4x4 backward",
         [P * i, weight, 4 * P * o, 4 * P * o, P * i, weight, o],
         |isa, [x, w, y, dy, dx, dw, db]| {
-            deconv4x4::backward(isa, GRID, x, source(w, y, dy), target(Some(dx), dw, db));
+            deconv4x4::backward(
+                isa,
+                GRID,
+                x,
+                GradientSource::rectified(w, y, dy),
+                GradientTarget {
+                    dx: Some(dx),
+                    dweight: dw,
+                    dbias: db,
+                },
+            );
         },
     );
 }
@@ -131,7 +132,7 @@ fn fusion() {
         "conv1x1 forward",
         [P * a, P * b, weight, o, P * o],
         |isa, [x, z, w, bias, y]| {
-            conv1x1::forward(isa, GRID, &[x, z], rectified(w, bias), y);
+            conv1x1::forward(isa, GRID, &[x, z], Convolution::rectified(w, bias), y);
         },
     );
     checks(
@@ -140,8 +141,18 @@ fn fusion() {
         |isa, [x, z, w, y, dy, dx, dz, dw, db]| {
             let inputs: [&[f32]; 2] = [x, z];
             let mut gradients = [Some(dx), Some(dz)];
-            let target = target(&mut gradients[..], dw, db);
-            conv1x1::backward(isa, GRID, &inputs, source(w, y, dy), target);
+            let target = GradientTarget {
+                dx: &mut gradients[..],
+                dweight: dw,
+                dbias: db,
+            };
+            conv1x1::backward(
+                isa,
+                GRID,
+                &inputs,
+                GradientSource::rectified(w, y, dy),
+                target,
+            );
         },
     );
 }

@@ -45,14 +45,6 @@ const GRID: Grid = Grid {
     width: 45,
 };
 
-fn rectified<'a>(weight: &'a [f32], bias: &'a [f32]) -> Convolution<'a> {
-    Convolution {
-        weight,
-        bias,
-        relu: true,
-    }
-}
-
 macro_rules! convolution_gives_the_same {
     ($kernel:ident, $inputs:expr, $outputs:expr, $taps:expr, $pixels:expr) => {
         let x = pattern(GRID.pixels() * $inputs, 1);
@@ -61,14 +53,16 @@ macro_rules! convolution_gives_the_same {
         let name = format!("{} {} to {}", stringify!($kernel), $inputs, $outputs);
         assert_same(&name, |isa| {
             let mut y = vec![0.0; dy.len()];
-            $kernel::forward(isa, GRID, &x, rectified(&weight, &bias), &mut y);
+            $kernel::forward(
+                isa,
+                GRID,
+                &x,
+                Convolution::rectified(&weight, &bias),
+                &mut y,
+            );
             let mut dx = vec![0.0; x.len()];
             let (mut dweight, mut dbias) = (vec![0.0; weight.len()], vec![0.0; $outputs]);
-            let source = GradientSource {
-                weight: &weight,
-                y: Some(&y),
-                dy: &dy,
-            };
+            let source = GradientSource::rectified(&weight, &y, &dy);
             let target = GradientTarget {
                 dx: Some(&mut dx[..]),
                 dweight: &mut dweight,
@@ -96,7 +90,13 @@ fn conv1x1_gives_the_same() {
     assert_same("conv1x1", |isa| {
         let views = [&xs[0][..], &xs[1][..]];
         let mut y = vec![0.0; dy.len()];
-        conv1x1::forward(isa, GRID, &views, rectified(&weight, &bias), &mut y);
+        conv1x1::forward(
+            isa,
+            GRID,
+            &views,
+            Convolution::rectified(&weight, &bias),
+            &mut y,
+        );
         let mut dxs = [vec![0.0; xs[0].len()], vec![0.0; xs[1].len()]];
         let (mut dweight, mut dbias) = (vec![0.0; weight.len()], vec![0.0; outputs]);
         let [first, second] = &mut dxs;
@@ -104,11 +104,7 @@ fn conv1x1_gives_the_same() {
             isa,
             GRID,
             &views,
-            GradientSource {
-                weight: &weight,
-                y: Some(&y),
-                dy: &dy,
-            },
+            GradientSource::rectified(&weight, &y, &dy),
             GradientTarget {
                 dx: &mut [Some(first), Some(second)],
                 dweight: &mut dweight,

@@ -3,7 +3,7 @@
 
 use std::ops::Range;
 
-use demc_kernels::conv1x1::{Epilogue, Part, add_part};
+use demc_kernels::conv1x1::{Epilogue, Part, forward_part};
 use demc_kernels::deconv4x4::PreparedDeconvolution;
 use demc_kernels::{Grid, Isa, memory};
 
@@ -100,6 +100,6 @@ impl PreparedLevel<'_> {
             first: 0,
             epilogue: self.epilogue,
         };
-        add_part(self.isa, decoded_grid, &[&decoded], part, sum);
+        forward_part(self.isa, decoded_grid, &[&decoded], part, sum);
     }
 }

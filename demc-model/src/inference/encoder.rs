@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use demc_kernels::conv1x1::{Epilogue, Part, add_part};
+use demc_kernels::conv1x1::{Epilogue, Part, forward_part};
 use demc_kernels::conv3x3::PreparedConvolution;
 use demc_kernels::{Grid, pool};
 
@@ -89,7 +89,7 @@ impl InferencePass<'_> {
                 ..Epilogue::default()
             },
         };
-        add_part(self.isa, grid, &[skip], part, sum);
+        forward_part(self.isa, grid, &[skip], part, sum);
     }
 
     /// The same on bands, encoder by encoder.

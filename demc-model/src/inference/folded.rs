@@ -42,11 +42,7 @@ impl HostValues {
 impl FoldedConv {
     /// The convolution with a ReLU after it.
     pub fn rectified(&self) -> Convolution<'_> {
-        Convolution {
-            weight: self.weight(),
-            bias: self.bias(),
-            relu: true,
-        }
+        Convolution::rectified(self.weight(), self.bias())
     }
 
     /// A convolution and the normalisation of its output, on `flex`.

@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use burn::backend::flex::FlexTensor;
 use burn::tensor::Tensor;
-use demc_kernels::conv1x1::{Epilogue, Part, add_part};
+use demc_kernels::conv1x1::{Epilogue, Part, forward_part};
 use demc_kernels::{Grid, Isa, blend, filter5x5, grid, memory, power};
 use rayon::prelude::*;
 
@@ -101,7 +101,7 @@ impl KernelHead {
                 add: false,
             },
         };
-        add_part(self.isa, band, &[decoded], part, &mut logits);
+        forward_part(self.isa, band, &[decoded], part, &mut logits);
         let images = image..image + 1 + self.layers;
         let x = scale.images(images.clone());
         let grid = Grid {

@@ -25,8 +25,8 @@ use collect::collect;
 /// Maximum number of output values over all taps for which collecting pays off.
 const MOST_COLLECTED: usize = 36;
 
-/// `y = epilogue(weight * x)` for the rows from `above` on, as many as `y` has. `x` is gated if a
-/// gate is given; `grid` is the grid of `x`.
+/// `y = epilogue(weight * source)` for the rows from `above` on, as many as `y` has. `grid` is the grid
+/// of `source`.
 ///
 /// # Panics
 /// If there are several images and `y` does not have all their rows.
@@ -34,19 +34,13 @@ const MOST_COLLECTED: usize = 36;
 pub(crate) fn convolve(
     isa: Isa,
     grid: Grid,
-    x: &[f32],
-    gate: Option<&[f32]>,
+    source: GatedMap,
     above: usize,
     weight: &[f32],
     axes: Axes,
     epilogue: BiasRelu,
     y: &mut [f32],
 ) {
-    let source = GatedMap {
-        map: x,
-        gate,
-        channels: axes.inputs,
-    };
     let height = y.len() / (grid.batch * grid.width * axes.outputs);
     assert!(
         above + height <= grid.height,
@@ -116,28 +110,16 @@ fn spread(
 /// order.
 const STRETCHES: usize = 16;
 
-/// Gradients with respect to the weight `[out, in, 3, 3]` and the bias. `dy` is gated if a gate is
-/// given.
+/// Gradients with respect to the weight `[out, in, 3, 3]` and the bias.
 pub(crate) fn gradient(
     isa: Isa,
     grid: Grid,
-    x: &[f32],
-    dy: &[f32],
-    gate: Option<&[f32]>,
+    x: GatedMap,
+    dy: GatedMap,
     dweight: &mut [f32],
     dbias: &mut [f32],
 ) {
-    let (inputs, outputs) = (grid.channels(x.len()), dbias.len());
-    let x = GatedMap {
-        map: x,
-        gate: None,
-        channels: inputs,
-    };
-    let dy = GatedMap {
-        map: dy,
-        gate,
-        channels: outputs,
-    };
+    let (inputs, outputs) = (x.channels, dy.channels);
     let products = WeightProducts::new(isa, grid, x, dy);
     let WeightProducts {
         by_output,

@@ -167,19 +167,16 @@ const CHUNK_VALUES: usize = 1 << 20;
 /// Tiles that one task transforms in [`gradient`]; the bias is summed over the same stretches.
 const TASK_TILES: usize = 32;
 
-/// Gradients with respect to the weight `[out, in, 3, 3]` and the bias. `dy` is gated if a gate is
-/// given.
-#[allow(clippy::too_many_arguments, reason = "the operands of a gradient")]
+/// Gradients with respect to the weight `[out, in, 3, 3]` and the bias.
 pub(crate) fn gradient<const IN: usize>(
     isa: Isa,
     grid: Grid,
-    x: &[f32],
-    dy: &[f32],
-    gate: Option<&[f32]>,
+    x: GatedMap,
+    dy: GatedMap,
     dweight: &mut [f32],
     dbias: &mut [f32],
 ) {
-    let (inputs, outputs) = (grid.channels(x.len()), grid.channels(dy.len()));
+    let (inputs, outputs) = (x.channels, dy.channels);
     assert_eq!(
         dweight.len(),
         outputs * inputs * 9,
@@ -187,21 +184,11 @@ pub(crate) fn gradient<const IN: usize>(
     );
     assert_eq!(dbias.len(), outputs, "a bias of {outputs} channels");
     assert!(
-        gate.is_none_or(|gate| gate.len() == dy.len()),
+        dy.gate.is_none_or(|gate| gate.len() == dy.map.len()),
         "the gate of a map of {} values",
-        dy.len()
+        dy.map.len()
     );
-    let source = GatedMap {
-        map: x,
-        gate: None,
-        channels: inputs,
-    };
-    let dy = GatedMap {
-        map: dy,
-        gate,
-        channels: outputs,
-    };
-    let (u, sums) = transformed_gradient::<IN>(isa, WinogradTiles::new(grid, IN - 2), source, dy);
+    let (u, sums) = transformed_gradient::<IN>(isa, WinogradTiles::new(grid, IN - 2), x, dy);
     let wide = padded(isa, outputs);
     for (o, dbias) in dbias.iter_mut().enumerate() {
         let sum: f64 = sums[o..].iter().step_by(wide).map(|x| f64::from(*x)).sum();

@@ -186,29 +186,27 @@ fn block_tiles(tiles: usize, values_per_tile: usize, weights: usize) -> usize {
     tiles.div_ceil(blocks)
 }
 
-/// `y = epilogue(w * x)`; `x` is gated if a gate is given.
+/// `y = epilogue(weights * source)`.
 ///
 /// # Panics
 /// If a length does not match its map.
 pub(crate) fn convolve<const IN: usize>(
     grid: Grid,
-    x: &[f32],
-    gate: Option<&[f32]>,
+    source: GatedMap,
     weights: &WinogradWeights,
     epilogue: BiasRelu,
     y: &mut [f32],
 ) {
-    convolve_rows::<IN>(grid, x, gate, 0, weights, epilogue, y);
+    convolve_rows::<IN>(grid, source, 0, weights, epilogue, y);
 }
 
-/// As [`convolve`], for the rows from `above` on, as many as `y` has. `grid` is the grid of `x`.
+/// As [`convolve`], for the rows from `above` on, as many as `y` has. `grid` is the grid of `source`.
 ///
 /// # Panics
-/// If a length does not match its map, or `x` lacks those rows.
+/// If a length does not match its map, or `source` lacks those rows.
 pub(crate) fn convolve_rows<const IN: usize>(
     grid: Grid,
-    x: &[f32],
-    gate: Option<&[f32]>,
+    source: GatedMap,
     above: usize,
     weights: &WinogradWeights,
     epilogue: BiasRelu,
@@ -217,7 +215,7 @@ pub(crate) fn convolve_rows<const IN: usize>(
     let (depth, columns) = (weights.depth, weights.columns);
     let height = y.len() / (grid.batch * grid.width * columns);
     assert_eq!(
-        x.len(),
+        source.map.len(),
         grid.pixels() * depth,
         "a map of {depth} channels on {grid:?}"
     );
@@ -232,15 +230,12 @@ pub(crate) fn convolve_rows<const IN: usize>(
         above + height
     );
     assert!(
-        gate.is_none_or(|gate| gate.len() == x.len()),
+        source
+            .gate
+            .is_none_or(|gate| gate.len() == source.map.len()),
         "the gate of a map of {} values",
-        x.len()
+        source.map.len()
     );
-    let source = GatedMap {
-        map: x,
-        gate,
-        channels: depth,
-    };
     let tiles = WinogradTiles::of_rows(grid, above, height, IN - 2);
     let step = block_tiles(
         tiles.count(),
