@@ -5,6 +5,7 @@ A `use` and a path in the code count; `mod` and a re-export (`pub use child::Nam
 as the file that defines it. Tests may import what they like.
 """
 
+import graphlib
 import pathlib
 import re
 import subprocess
@@ -30,7 +31,7 @@ def without_tests(code):
 
 
 def leaves(tree, prefix=()):
-    """The paths of a use tree: `a::{b, c as d}` gives (a, b), d = (a, c), as pairs of path and name."""
+    """The paths of a use tree, each with its name: `a::{b, c as d}` has the path (a, b) named b and (a, c) named d."""
     tree = tree.strip()
     brace = tree.find("{")
     if brace < 0:
@@ -111,23 +112,17 @@ class Crate:
         }
 
 
-def circles(edges):
-    """The sets of two or more nodes that reach each other."""
-    reach = {}
-    for node in edges:
-        seen, todo = set(), list(edges[node])
-        while todo:
-            if (next_node := todo.pop()) not in seen:
-                seen.add(next_node)
-                todo.extend(edges.get(next_node, ()))
-        reach[node] = seen
-    groups = {frozenset(other for other in reach[node] if node in reach.get(other, ())) for node in edges if node in reach[node]}
-    return [sorted(group) for group in groups if len(group) > 1]
+def circle(edges):
+    """The nodes of a circle, if there is one."""
+    try:
+        graphlib.TopologicalSorter(edges).prepare()
+    except graphlib.CycleError as error:
+        return [sorted(set(error.args[1]))]
+    return []
 
 
 def folder_circles(imports):
     """Circles between the entries of one folder, a file or a folder each."""
-    found = []
     for folder in {module[:depth] for module in imports for depth in range(len(module))}:
         edges = {}
         for module, targets in imports.items():
@@ -136,8 +131,7 @@ def folder_circles(imports):
             entry = module[: len(folder) + 1]
             others = {target[: len(folder) + 1] for target in targets if target[: len(folder)] == folder and target != folder}
             edges.setdefault(entry, set()).update(others - {entry})
-        found += circles(edges)
-    return found
+        yield from circle(edges)
 
 
 def main():
@@ -148,7 +142,7 @@ def main():
         crate = Crate(root, [file for file in files if root in file.parents])
         checked += len(crate.files)
         imports = crate.imports()
-        for group in {tuple(group) for group in circles(imports) + folder_circles(imports)}:
+        for group in {tuple(group) for group in (*circle(imports), *folder_circles(imports))}:
             failed = True
             print(f"{root}: a circle of {', '.join('::'.join(module) or 'the root' for module in group)}")
             for module in sorted(imports):

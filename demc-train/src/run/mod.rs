@@ -5,7 +5,6 @@ pub mod data;
 pub mod estimate;
 pub mod initial;
 pub mod observer;
-pub mod own_files;
 pub mod place;
 pub mod run_dir;
 pub mod run_record;

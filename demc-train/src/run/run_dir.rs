@@ -23,8 +23,7 @@ use crate::config::Config;
 use crate::record::metrics_log::METRICS;
 use crate::run::checkpoint::store::CheckpointStore;
 use crate::run::data::TrainingData;
-use crate::run::own_files::{CONFIG, LAYOUT, OWN_FILES, RUN, is_usable};
-use crate::run::run_record::{RecordedSetup, RunRecord};
+use crate::run::run_record::{CONFIG, LAYOUT, OWN_FILES, RUN, RecordedSetup, RunRecord, is_usable};
 
 /// Locked by the training process.
 const LOCK: &str = "lock";

@@ -1,4 +1,5 @@
-//! `run.json`: versions, device, scenes and statistics at the start of a run.
+//! The files that describe a run, and the content of one of them, `run.json`: versions, device, scenes
+//! and statistics at the start of the run.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -8,11 +9,34 @@ use demc_data::{ChannelLayout, Normalizer, Scene};
 use demc_program::message::short_list;
 use serde::{Deserialize, Serialize};
 
+use crate::config::Config;
 use crate::run::data::TrainingData;
 use crate::run::initial::InitialWeights;
 
 /// The manifest that pins the version of Burn; Burn itself exports none.
 const MANIFEST: &str = include_str!("../../../Cargo.toml");
+
+/// The resolved configuration.
+pub const CONFIG: &str = "config.toml";
+/// The record of versions, device and data.
+pub const RUN: &str = "run.json";
+/// The channel layout, if it is not a preset.
+pub const LAYOUT: &str = "layout.toml";
+/// The files of a run directory that describe the run. Its checkpoints have copies of them.
+pub const OWN_FILES: [&str; 3] = [CONFIG, RUN, LAYOUT];
+
+/// Whether the bytes of one of [`OWN_FILES`] in a run directory can be used. The record of a run
+/// never changes, so that of a checkpoint is preferred.
+pub fn is_usable(name: &str, bytes: &[u8]) -> bool {
+    let Ok(text) = str::from_utf8(bytes) else {
+        return false;
+    };
+    match name {
+        CONFIG => Config::parse(Path::new(CONFIG), text, &[]).is_ok(),
+        LAYOUT => toml::from_str::<ChannelLayout>(text).is_ok(),
+        _ => false,
+    }
+}
 
 /// The content of `run.json`.
 #[derive(Debug, Serialize, Deserialize)]

@@ -30,7 +30,7 @@ use demc_program::file::write_whole;
 use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
-use crate::run::own_files::{OWN_FILES, is_usable};
+use crate::run::run_record::{OWN_FILES, is_usable};
 use crate::run::warnings::WarningState;
 use crate::step::optimizer::Optimizer;
 use store::CheckpointStore;
