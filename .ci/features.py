@@ -15,6 +15,7 @@ WITHOUT_CLI = {"cargo build -p demc-c", "the library of demc-infer"}
 # What a command builds, as options of `cargo tree`.
 COMMANDS = {
     "cargo test --workspace": ["--workspace", "-e", "normal,build,dev"],
+    "cargo test -p demc-model -p demc-infer": ["-p", "demc-model", "-p", "demc-infer", "-e", "normal,build,dev"],
     "cargo build": ["--workspace", "-e", "normal,build"],
     "cargo run -p demc-infer": ["-p", "demc-infer", "-e", "normal,build"],
     "cargo run -p demc-infer --example frame": ["-p", "demc-infer", "-e", "normal,build,dev"],
