@@ -124,8 +124,9 @@ fn files(bundle: &Bundle, file: &Path) -> anyhow::Result<()> {
         ROUNDS,
         [
             &mut || {
-                let input = ExrFile::open(file).expect("it was read before");
-                let mut input = input.keeping(&layout.color, KEPT_BYTES);
+                let mut input = ExrFile::open(file)
+                    .expect("it was read before")
+                    .keeping(&layout.color, KEPT_BYTES);
                 let frame = decode_input(&mut input, layout).expect("it was read before");
                 std::hint::black_box(frame);
                 open.replace(Some(input));

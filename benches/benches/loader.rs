@@ -28,8 +28,10 @@ const BATCH: usize = 4;
 const PATCH: usize = 128;
 
 fn main() -> anyhow::Result<()> {
-    let width = std::env::args().skip(1).find_map(|word| word.parse().ok());
-    let width: usize = width.unwrap_or(16);
+    let width: usize = std::env::args()
+        .skip(1)
+        .find_map(|word| word.parse().ok())
+        .unwrap_or(16);
     let config = DataConfig {
         root: Path::new(env!("CARGO_MANIFEST_DIR")).join("../data/sample"),
         batch_size: BATCH,

@@ -64,8 +64,9 @@ pub fn network(width: usize) -> Bundle {
         flat_color: [0.5; 3],
     };
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
-    let model = config.load(&mut Weights::new(weights), &Device::flex());
-    let model = model.expect("the network's own weights");
+    let model = config
+        .load(&mut Weights::new(weights), &Device::flex())
+        .expect("the network's own weights");
     Bundle::new(BundleMeta::new(config, normalizer, layout, 0), model)
 }
 
@@ -231,8 +232,10 @@ mod tests {
             let features = TensorData::new(input.batch.features_z.clone(), shape);
             let map = network
                 .model
-                .detail_map(Tensor::from_data(features, &device));
-            let map = map.expect("DEMC has one").try_into_vec_as().expect("read");
+                .detail_map(Tensor::from_data(features, &device))
+                .expect("DEMC has one")
+                .try_into_vec_as()
+                .expect("read");
             let out = Inference::new(network, input, &device).run();
             for values in [map, out] {
                 let mean = values.iter().sum::<f32>() / values.len() as f32;

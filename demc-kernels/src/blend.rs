@@ -53,6 +53,42 @@ fn halve_first(grid: Grid, x: &[f32], channels: usize, y: &mut [f32], kept: usiz
         });
 }
 
+/// A filtered image with its blend weight, and the output of the level below.
+#[derive(Clone, Copy, Debug)]
+pub struct Scales<'a> {
+    /// Filtered image and blend weight.
+    pub filtered: &'a [f32],
+    /// Output of the level below.
+    pub coarse: &'a [f32],
+}
+
+impl Scales<'_> {
+    #[track_caller]
+    fn check(self, grid: Grid) {
+        assert_eq!(
+            self.filtered.len(),
+            grid.pixels() * BLENDED,
+            "the filtered image on {grid:?}"
+        );
+        assert_eq!(
+            self.coarse.len(),
+            grid.halved().pixels() * COLORS,
+            "the coarse image on {grid:?}, halved"
+        );
+    }
+
+    /// `c - D(y)`.
+    fn correction(self, grid: Grid) -> Scratch {
+        let mut correction = Scratch::take(self.coarse.len());
+        halve_first(grid, self.filtered, BLENDED, &mut correction, COLORS);
+        correction
+            .par_iter_mut()
+            .zip(self.coarse)
+            .for_each(|(mean, coarse)| *mean = coarse - *mean);
+        correction
+    }
+}
+
 /// The blend of a filtered image and its blend weight with the output of the level below.
 ///
 /// # Shapes
@@ -61,10 +97,11 @@ fn halve_first(grid: Grid, x: &[f32], channels: usize, y: &mut [f32], kept: usiz
 ///
 /// # Panics
 /// If a length does not match the others or a side is odd.
-pub fn forward(grid: Grid, filtered: &[f32], coarse: &[f32], out: &mut [f32]) {
-    check(grid, filtered, coarse);
+pub fn forward(grid: Grid, scales: Scales, out: &mut [f32]) {
+    scales.check(grid);
     assert_eq!(out.len(), grid.pixels() * COLORS, "the output on {grid:?}");
-    let correction = correction(grid, filtered, coarse);
+    let filtered = scales.filtered;
+    let correction = scales.correction(grid);
     let rows = Rows::of(grid);
     out.par_chunks_mut(grid.width * COLORS)
         .enumerate()
@@ -92,13 +129,13 @@ pub fn forward(grid: Grid, filtered: &[f32], coarse: &[f32], out: &mut [f32]) {
 /// If a length does not match the others or a side is odd.
 pub fn backward(
     grid: Grid,
-    filtered: &[f32],
-    coarse: &[f32],
+    scales: Scales,
     dout: &[f32],
     dfiltered: &mut [f32],
     dcoarse: &mut [f32],
 ) {
-    check(grid, filtered, coarse);
+    scales.check(grid);
+    let Scales { filtered, coarse } = scales;
     assert_eq!(
         dout.len(),
         grid.pixels() * COLORS,
@@ -114,7 +151,7 @@ pub fn backward(
         coarse.len(),
         "the coarse image and its gradient"
     );
-    let correction = correction(grid, filtered, coarse);
+    let correction = scales.correction(grid);
     let rows = Rows::of(grid);
     let (row_in, row_out) = (grid.width * BLENDED, grid.width * COLORS);
     // The gradient of the doubled correction, and that of the blend weight.
@@ -160,31 +197,6 @@ pub fn backward(
                 }
             }
         });
-}
-
-#[track_caller]
-fn check(grid: Grid, filtered: &[f32], coarse: &[f32]) {
-    assert_eq!(
-        filtered.len(),
-        grid.pixels() * BLENDED,
-        "the filtered image on {grid:?}"
-    );
-    assert_eq!(
-        coarse.len(),
-        grid.halved().pixels() * COLORS,
-        "the coarse image on {grid:?}, halved"
-    );
-}
-
-/// `c - D(y)`.
-fn correction(grid: Grid, filtered: &[f32], coarse: &[f32]) -> Scratch {
-    let mut correction = Scratch::take(coarse.len());
-    halve_first(grid, filtered, BLENDED, &mut correction, COLORS);
-    correction
-        .par_iter_mut()
-        .zip(coarse)
-        .for_each(|(mean, coarse)| *mean = coarse - *mean);
-    correction
 }
 
 /// Rows of the images of a batch, doubled and back.
@@ -298,7 +310,11 @@ mod tests {
     fn it_is_the_plain_sum() {
         for grid in even_grids() {
             let [filtered, coarse, mut out] = case(grid);
-            forward(grid, &filtered, &coarse, &mut out);
+            let scales = Scales {
+                filtered: &filtered,
+                coarse: &coarse,
+            };
+            forward(grid, scales, &mut out);
             let expected = reference::blend(grid, &f64s(&filtered), &f64s(&coarse));
             assert_close(&format!("{grid:?}"), &out, &expected);
         }
@@ -311,7 +327,11 @@ mod tests {
             let [filtered, coarse, dout] = case(grid);
             let mut gradients = [vec![f32::NAN; filtered.len()], vec![f32::NAN; coarse.len()]];
             let [dfiltered, dcoarse] = &mut gradients;
-            backward(grid, &filtered, &coarse, &dout, dfiltered, dcoarse);
+            let scales = Scales {
+                filtered: &filtered,
+                coarse: &coarse,
+            };
+            backward(grid, scales, &dout, dfiltered, dcoarse);
             let inputs = [f64s(&filtered), f64s(&coarse)];
             let sum = |inputs: &[Vec<f64>; 2]| -> f64 {
                 let out = reference::blend(grid, &inputs[0], &inputs[1]);
@@ -347,10 +367,14 @@ mod tests {
             width: 36,
         };
         let [filtered, coarse, dout] = case(grid);
+        let scales = Scales {
+            filtered: &filtered,
+            coarse: &coarse,
+        };
         same_on_any_number_of_threads(|| {
             let (mut out, mut d, mut dc) = (dout.clone(), filtered.clone(), coarse.clone());
-            forward(grid, &filtered, &coarse, &mut out);
-            backward(grid, &filtered, &coarse, &dout, &mut d, &mut dc);
+            forward(grid, scales, &mut out);
+            backward(grid, scales, &dout, &mut d, &mut dc);
             [bits(&out), bits(&d), bits(&dc)]
         });
     }
@@ -364,7 +388,11 @@ mod tests {
         };
         let filtered: Vec<f32> = [0.3, 0.3, 0.3, 0.8].repeat(16);
         let mut out = vec![0.0; 48];
-        forward(grid, &filtered, &[0.3; 12], &mut out);
+        let scales = Scales {
+            filtered: &filtered,
+            coarse: &[0.3; 12],
+        };
+        forward(grid, scales, &mut out);
         assert!(out.iter().all(|out| (out - 0.3).abs() < 1e-6));
     }
 }

@@ -87,8 +87,8 @@ pub(crate) fn power(x: f64, exponent: f64) -> f64 {
     // 0, infinity and NaN have no such parts; negative values have no power.
     let plain = series * scale;
     let at_zero = if exponent == 0.0 { 1.0 } else { 0.0 };
-    let other = if x == 0.0 { at_zero } else { x };
-    let other = if x < 0.0 { f64::NAN } else { other };
+    let not_negative = if x == 0.0 { at_zero } else { x };
+    let other = if x < 0.0 { f64::NAN } else { not_negative };
     if x > 0.0 && x < f64::INFINITY {
         plain
     } else {

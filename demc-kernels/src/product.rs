@@ -37,6 +37,31 @@ pub(crate) enum Right {
     Rows { start: *const f32, step: usize },
 }
 
+/// Extents of a product.
+#[derive(Clone, Copy)]
+pub(crate) struct Size {
+    pub(crate) rows: usize,
+    /// Length of the reduction.
+    pub(crate) depth: usize,
+    pub(crate) columns: usize,
+}
+
+/// The result: rows `step` values apart.
+#[derive(Clone, Copy)]
+pub(crate) struct Target {
+    pub(crate) start: *mut f32,
+    pub(crate) step: usize,
+    /// Whether the product is added to the content.
+    pub(crate) accumulate: bool,
+}
+
+/// Some columns of a right operand: rows `step` values apart.
+#[derive(Clone, Copy)]
+struct Panel {
+    start: *const f32,
+    step: usize,
+}
+
 /// The division of `columns` of a packed right operand into panels.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Panels {
@@ -61,45 +86,46 @@ impl Panels {
     }
 }
 
-/// `C = A B`, or `C += A B`, of `rows` x `columns` with a reduction over `depth`. The rows of C are
-/// `c_step` values apart.
+/// `C = A B`, or `C += A B`.
 ///
 /// # Safety
 /// The machine has the path of `S`. A is readable and C writable for [`padded_rows`]; B and C have
 /// whole vectors of columns.
 #[inline(always)]
-#[allow(clippy::too_many_arguments, reason = "the operands of a product")]
-pub(crate) unsafe fn product<S: Simd>(
-    rows: usize,
-    depth: usize,
-    columns: usize,
-    a: Left,
-    b: Right,
-    c: *mut f32,
-    c_step: usize,
-    accumulate: bool,
-) {
+pub(crate) unsafe fn product<S: Simd>(size: Size, a: Left, b: Right, c: Target) {
+    let Size {
+        rows,
+        depth,
+        columns,
+    } = size;
     let panels = Panels::new::<S>(columns);
     let mut first = 0;
     while first < panels.padded {
         let width = panels.full.min(panels.padded - first);
-        let (b, b_step) = match b {
-            // SAFETY: the panel lies within the operand.
-            Right::Packed(start) => (unsafe { start.add(first * depth) }, width),
-            // SAFETY: as above.
-            Right::Rows { start, step } => (unsafe { start.add(first) }, step),
+        let b = match b {
+            Right::Packed(start) => Panel {
+                // SAFETY: the panel lies within the operand.
+                start: unsafe { start.add(first * depth) },
+                step: width,
+            },
+            Right::Rows { start, step } => Panel {
+                // SAFETY: as above.
+                start: unsafe { start.add(first) },
+                step,
+            },
         };
         // SAFETY: the columns from `first` are C's; the rest is the caller's.
         unsafe {
-            let c = c.add(first);
+            let start = c.start.add(first);
+            let c = Target { start, ..c };
             match (width / S::LANES, S::ACCUMULATORS) {
-                (4, _) => strip::<S, 6, 4>(rows, depth, a, b, b_step, c, c_step, accumulate),
-                (3, _) => strip::<S, 8, 3>(rows, depth, a, b, b_step, c, c_step, accumulate),
-                (2, 24..) => strip::<S, 12, 2>(rows, depth, a, b, b_step, c, c_step, accumulate),
-                (2, 12..) => strip::<S, 6, 2>(rows, depth, a, b, b_step, c, c_step, accumulate),
-                (2, _) => strip::<S, 4, 2>(rows, depth, a, b, b_step, c, c_step, accumulate),
-                (_, 12..) => strip::<S, 12, 1>(rows, depth, a, b, b_step, c, c_step, accumulate),
-                _ => strip::<S, 8, 1>(rows, depth, a, b, b_step, c, c_step, accumulate),
+                (4, _) => strip::<S, 6, 4>(rows, depth, a, b, c),
+                (3, _) => strip::<S, 8, 3>(rows, depth, a, b, c),
+                (2, 24..) => strip::<S, 12, 2>(rows, depth, a, b, c),
+                (2, 12..) => strip::<S, 6, 2>(rows, depth, a, b, c),
+                (2, _) => strip::<S, 4, 2>(rows, depth, a, b, c),
+                (_, 12..) => strip::<S, 12, 1>(rows, depth, a, b, c),
+                _ => strip::<S, 8, 1>(rows, depth, a, b, c),
             }
         }
         first += width;
@@ -108,24 +134,31 @@ pub(crate) unsafe fn product<S: Simd>(
 
 /// One panel of columns: blocks of `R` rows.
 #[inline(always)]
-#[allow(clippy::too_many_arguments, reason = "as `product`")]
 unsafe fn strip<S: Simd, const R: usize, const V: usize>(
     rows: usize,
     depth: usize,
     a: Left,
-    b: *const f32,
-    b_step: usize,
-    c: *mut f32,
-    c_step: usize,
-    accumulate: bool,
+    b: Panel,
+    c: Target,
 ) {
     let mut row = 0;
     while row < rows {
         // SAFETY: rows up to `padded_rows` are there.
         unsafe {
-            let start = a.start.add(row * a.row_step);
-            let c = c.add(row * c_step);
-            block::<S, R, V>(depth, Left { start, ..a }, b, b_step, c, c_step, accumulate);
+            let a_start = a.start.add(row * a.row_step);
+            let c_start = c.start.add(row * c.step);
+            block::<S, R, V>(
+                depth,
+                Left {
+                    start: a_start,
+                    ..a
+                },
+                b,
+                Target {
+                    start: c_start,
+                    ..c
+                },
+            );
         }
         row += R;
     }
@@ -140,23 +173,20 @@ unsafe fn strip<S: Simd, const R: usize, const V: usize>(
 unsafe fn block<S: Simd, const R: usize, const V: usize>(
     depth: usize,
     a: Left,
-    b: *const f32,
-    b_step: usize,
-    c: *mut f32,
-    c_step: usize,
-    accumulate: bool,
+    b: Panel,
+    c: Target,
 ) {
     // SAFETY: the caller's: every place is a value of A, B or C.
     unsafe {
         let mut sums = [[S::zero(); V]; R];
-        if accumulate {
+        if c.accumulate {
             for r in 0..R {
                 for v in 0..V {
-                    sums[r][v] = S::load(c.add(r * c_step + v * S::LANES));
+                    sums[r][v] = S::load(c.start.add(r * c.step + v * S::LANES));
                 }
             }
         }
-        let (mut a_k, mut b_k) = (a.start, b);
+        let (mut a_k, mut b_k) = (a.start, b.start);
         for _ in 0..depth {
             let mut columns = [S::zero(); V];
             for v in 0..V {
@@ -169,11 +199,11 @@ unsafe fn block<S: Simd, const R: usize, const V: usize>(
                 }
             }
             a_k = a_k.wrapping_add(a.k_step);
-            b_k = b_k.wrapping_add(b_step);
+            b_k = b_k.wrapping_add(b.step);
         }
         for r in 0..R {
             for v in 0..V {
-                S::store(c.add(r * c_step + v * S::LANES), sums[r][v]);
+                S::store(c.start.add(r * c.step + v * S::LANES), sums[r][v]);
             }
         }
     }

@@ -194,14 +194,17 @@ mod tests {
     ) -> (f64, Vec<f64>) {
         let gamma = f64::from(gamma);
         let mut sum = 0.0;
-        let gradient = out.iter().zip(reference).map(|(out, reference)| {
-            let (out, reference) = (f64::from(*out), f64::from(*reference));
-            let difference = out.powf(gamma) - reference;
-            let share = 1.0 / (reference * reference + f64::from(epsilon)) / pixels as f64;
-            sum += difference * difference * share;
-            2.0 * difference * share * gamma * out.powf(gamma - 1.0)
-        });
-        let gradient = gradient.collect();
+        let gradient = out
+            .iter()
+            .zip(reference)
+            .map(|(out, reference)| {
+                let (out, reference) = (f64::from(*out), f64::from(*reference));
+                let difference = out.powf(gamma) - reference;
+                let share = 1.0 / (reference * reference + f64::from(epsilon)) / pixels as f64;
+                sum += difference * difference * share;
+                2.0 * difference * share * gamma * out.powf(gamma - 1.0)
+            })
+            .collect();
         (sum, gradient)
     }
 

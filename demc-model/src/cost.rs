@@ -246,8 +246,8 @@ mod tests {
         assert!(specs.iter().all(|spec| spec.stage != Stage::Fusion));
         let deepest = specs
             .iter()
-            .find(|spec| spec.name == "decoder.levels.0.deconv.weight");
-        let deepest = deepest.expect("a decoder");
+            .find(|spec| spec.name == "decoder.levels.0.deconv.weight")
+            .expect("a decoder");
         assert_eq!(deepest.stage, Stage::Decoder { level: 4 });
         assert_eq!((deepest.rows(), deepest.fan_in()), (Some(8), 8 * 4));
         assert_eq!(deepest.layer(), "decoder.levels.0.deconv");

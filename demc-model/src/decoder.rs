@@ -43,12 +43,13 @@ impl Decoder {
             Head::Xavier => Some((Init::Xavier(1.0), Init::Zeros)),
             Head::Kernel => None,
         };
-        let head = init.map(|(weight, bias)| {
-            b.enter(Stage::Head { level: 0 }).part("head", |b| {
-                conv3x3(b, [channels[0], COLOR_CHANNELS], weight, bias)
+        let head = init
+            .map(|(weight, bias)| {
+                b.enter(Stage::Head { level: 0 }).part("head", |b| {
+                    conv3x3(b, [channels[0], COLOR_CHANNELS], weight, bias)
+                })
             })
-        });
-        let head = head.transpose()?;
+            .transpose()?;
         let kernels = match config.head {
             Head::Kernel => kernel_head::build(b, &channels)?,
             Head::Grey | Head::Xavier => Vec::new(),

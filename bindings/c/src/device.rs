@@ -86,12 +86,13 @@ impl Threads {
             pool: None,
             handles: Vec::new(),
         };
-        let builder = ThreadPoolBuilder::new().num_threads(count);
-        let builder = builder.spawn_handler(|thread| {
-            let named = Builder::new().name(format!("demc-{}", thread.index()));
-            threads.handles.push(named.spawn(|| thread.run())?);
-            Ok(())
-        });
+        let builder = ThreadPoolBuilder::new()
+            .num_threads(count)
+            .spawn_handler(|thread| {
+                let named = Builder::new().name(format!("demc-{}", thread.index()));
+                threads.handles.push(named.spawn(|| thread.run())?);
+                Ok(())
+            });
         let pool = builder
             .build()
             .map_err(|error| Failure::memory(format!("cannot start {count} threads: {error}")));

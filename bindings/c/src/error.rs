@@ -76,8 +76,10 @@ impl Failure {
     }
 
     fn panic(panic: &(dyn Any + Send)) -> Self {
-        let text = panic.downcast_ref::<String>().map(String::as_str);
-        let text = text.or_else(|| panic.downcast_ref::<&str>().copied());
+        let text = panic
+            .downcast_ref::<String>()
+            .map(String::as_str)
+            .or_else(|| panic.downcast_ref::<&str>().copied());
         Self {
             code: DemcError::Unknown,
             message: format!("internal error: {}", text.unwrap_or("no reason given")),
@@ -172,8 +174,7 @@ fn with_error<T>(
 ) -> Option<T> {
     match device {
         Some(errors) => {
-            let errors = errors.0.lock();
-            let mut errors = errors.unwrap_or_else(PoisonError::into_inner);
+            let mut errors = errors.0.lock().unwrap_or_else(PoisonError::into_inner);
             Some(work(errors.entry(THREAD.with(|id| *id)).or_default()))
         }
         None => {
@@ -190,8 +191,8 @@ pub(crate) fn guarded<T>(
     otherwise: T,
     work: impl FnOnce() -> Result<T, Failure>,
 ) -> T {
-    let done = catch_unwind(AssertUnwindSafe(work));
-    let done = done.unwrap_or_else(|panic| Err(Failure::panic(&*panic)));
+    let done =
+        catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| Err(Failure::panic(&*panic)));
     done.unwrap_or_else(|failure| {
         with_error(device, |error| error.record(failure));
         otherwise

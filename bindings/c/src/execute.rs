@@ -76,8 +76,9 @@ impl<'a> Images<'a> {
         };
         let mut names: Vec<&str> = Vec::new();
         for name in settings.images.keys() {
-            let layer = name.strip_prefix(LAYER);
-            let layer = layer.or_else(|| name.strip_prefix(OUTPUT_LAYER));
+            let layer = name
+                .strip_prefix(LAYER)
+                .or_else(|| name.strip_prefix(OUTPUT_LAYER));
             names.extend(layer.filter(|layer| !names.contains(layer)));
         }
         let mut layers = Vec::new();

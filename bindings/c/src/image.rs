@@ -56,8 +56,9 @@ const ONE: [&str; 2] = ["alpha", "outputAlpha"];
 /// # Errors
 /// It is unknown, or a layer without a name.
 pub(crate) fn check_name(name: &str) -> Result<(), Failure> {
-    let layer = name.strip_prefix(LAYER);
-    let layer = layer.or_else(|| name.strip_prefix(OUTPUT_LAYER));
+    let layer = name
+        .strip_prefix(LAYER)
+        .or_else(|| name.strip_prefix(OUTPUT_LAYER));
     let is_known = layer.is_some_and(|layer| !layer.is_empty());
     if is_known || THREE.contains(&name) || ONE.contains(&name) {
         Ok(())

@@ -361,8 +361,9 @@ fn positions_relative_to_the_image_are_mapped_before_statistics_and_batches() {
 
     let spread = |space| {
         let scenes = train_scenes();
-        let measured = Statistics::measure(&scenes, &layout(), &config(space), 0.001);
-        let measured = measured.expect("the sample is sound").normalizer;
+        let measured = Statistics::measure(&scenes, &layout(), &config(space), 0.001)
+            .expect("the sample is sound")
+            .normalizer;
         assert_eq!(measured.position, space);
         measured.features.std[3..6]
             .iter()

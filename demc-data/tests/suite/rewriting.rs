@@ -229,8 +229,10 @@ fn equal_images_give_equal_bytes() {
 
 fn blocks(path: &Path, part: usize) -> Vec<String> {
     let file = BufReader::new(File::open(path).expect("readable"));
-    let chunks = exr::block::read(file, false).and_then(|file| file.all_chunks(false));
-    let chunks = chunks.expect("readable").map(|chunk| chunk.expect("whole"));
+    let chunks = exr::block::read(file, false)
+        .and_then(|file| file.all_chunks(false))
+        .expect("readable")
+        .map(|chunk| chunk.expect("whole"));
     let of_part = chunks.filter(|chunk| chunk.layer_index == part);
     let blocks: Vec<String> = of_part.map(|chunk| format!("{chunk:?}")).collect();
     assert!(!blocks.is_empty());

@@ -17,8 +17,8 @@ fn python(arguments: &[&str]) -> Result<String, String> {
         .arg("-c")
         .arg(SCRIPT)
         .args(arguments)
-        .output();
-    let output = output.map_err(|error| format!("{} does not start: {error}", python.display()))?;
+        .output()
+        .map_err(|error| format!("{} does not start: {error}", python.display()))?;
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
     if output.status.success() {
         Ok(text(&output.stdout))

@@ -100,8 +100,8 @@ fn the_chosen_precision_is_used_and_clamped_samples_are_counted() {
         let written = write_denoised(&input, &layout(), &bright, &output, &options);
         let half = after == SampleType::F16;
         assert_eq!(written.expect("sound").clamped, if half { 3 } else { 0 });
-        let read = ExrFile::open(&output).and_then(|mut file| file.read(&["R", "G", "B"]));
-        let read: Vec<f32> = read
+        let read: Vec<f32> = ExrFile::open(&output)
+            .and_then(|mut file| file.read(&["R", "G", "B"]))
             .expect("sound")
             .iter()
             .flat_map(Plane::to_f32)
@@ -261,8 +261,8 @@ fn writes_until_the_disk_is_full() {
     );
     fs::write(&output, "old").expect("there is room");
     let options = WriteOptions::default();
-    let error = write_denoised(&input, &layout(), &color(PIXELS), &output, &options);
-    let error = error.expect_err("there is no room");
+    let error = write_denoised(&input, &layout(), &color(PIXELS), &output, &options)
+        .expect_err("there is no room");
     assert_eq!(
         error.to_string(),
         format!("cannot write {}", output.display())

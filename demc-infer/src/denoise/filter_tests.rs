@@ -38,8 +38,9 @@ fn filtered_by_hand(bundle: &Bundle, original: &Frame) -> Frame {
         .map(|x| x.clamp(0.0, 1.0))
         .collect();
     let filter = bundle.albedo_filter.as_ref().expect("a filter");
-    let image = denoise(filter, &noisy, &Tiling::default(), Ensemble::One);
-    let image = image.expect("denoised").color_hdr;
+    let image = denoise(filter, &noisy, &Tiling::default(), Ensemble::One)
+        .expect("denoised")
+        .color_hdr;
     let pixels = padded.width * padded.height;
     for (i, (value, filtered)) in albedo(&mut padded).iter_mut().zip(image).enumerate() {
         let has_surface = (0..3).any(|channel| noisy.color[channel * pixels + i % pixels] > 0.0);

@@ -22,8 +22,8 @@ fn images(dir: &Path, name: &str, change: impl Fn(f32) -> f32) -> PathBuf {
     fs::create_dir(&out).expect("directory");
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
     for scene in SCENES {
-        let frame = read_frame(&sample().join(format!("test/{scene}.exr")), &layout);
-        let frame = frame.expect("a scene");
+        let frame =
+            read_frame(&sample().join(format!("test/{scene}.exr")), &layout).expect("a scene");
         let planes: Vec<f32> = frame
             .reference
             .iter()

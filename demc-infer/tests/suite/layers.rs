@@ -28,8 +28,8 @@ fn read(path: &Path, layer: &str) -> Vec<f32> {
     let names = ["R", "G", "B"].map(|channel| format!("ViewLayer.{layer}.{channel}"));
     let planes = ExrFile::open(path)
         .expect("an EXR file")
-        .read(&names.each_ref().map(String::as_str));
-    let planes = planes.expect("its channels");
+        .read(&names.each_ref().map(String::as_str))
+        .expect("its channels");
     planes.iter().flat_map(Plane::to_f32).collect()
 }
 

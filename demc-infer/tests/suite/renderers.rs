@@ -49,8 +49,9 @@ fn color_names(file: &ExrFile) -> [String; 3] {
 
 fn color(path: &Path) -> Vec<f32> {
     let mut file = open(path);
-    let planes = file.read(&color_names(&file).each_ref().map(String::as_str));
-    let planes = planes.expect("colour");
+    let planes = file
+        .read(&color_names(&file).each_ref().map(String::as_str))
+        .expect("colour");
     planes.iter().flat_map(Plane::to_f32).collect()
 }
 
@@ -212,8 +213,8 @@ fn a_missing_second_texture_hardly_matters() {
         "gen-room-test-1",
         "gen-table-test-1",
     ] {
-        let frame = demc_data::read_frame(&scenes.join(format!("{name}.exr")), &layout);
-        let frame = frame.expect("the sample is sound");
+        let frame = demc_data::read_frame(&scenes.join(format!("{name}.exr")), &layout)
+            .expect("the sample is sound");
         let reference = frame.reference.clone().expect("the sample has one");
         let mut without = frame.clone();
         let first = buffer(&mut without, 2).to_vec();

@@ -49,8 +49,11 @@ fn a_report_works_in_a_browser() {
     ])
     .success();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/suite/report_browser.py");
-    let output = Command::new(&python).arg(script).arg(&file).output();
-    let output = output.expect("DEMC_PYTHON runs");
+    let output = Command::new(&python)
+        .arg(script)
+        .arg(&file)
+        .output()
+        .expect("DEMC_PYTHON runs");
     assert!(
         output.status.success(),
         "{}{}",

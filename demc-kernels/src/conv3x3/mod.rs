@@ -10,6 +10,7 @@ mod winograd;
 
 use crate::{Convolution, GradientSource, GradientTarget, Grid, Isa};
 use parts::{Axes, BiasRelu, GatedMap};
+use thin::ThinConvolution;
 
 /// Tiles of the Winograd transforms.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -134,8 +135,13 @@ impl<'a> PreparedConvolution<'a> {
         let (x, epilogue) = (GatedMap::open(x, self.inputs), self.epilogue);
         match &self.weights {
             PreparedWeights::Thin(weight) => {
-                let axes = Axes::new(self.outputs, self.inputs, false);
-                thin::convolve(self.isa, grid, x, above, weight, axes, epilogue, y);
+                let operands = ThinConvolution {
+                    grid,
+                    source: x,
+                    weight,
+                    axes: Axes::new(self.outputs, self.inputs, false),
+                };
+                thin::convolve(self.isa, operands, above, epilogue, y);
             }
             PreparedWeights::F2(weights) => {
                 winograd::convolve_rows::<4>(grid, x, above, weights, epilogue, y)
@@ -183,8 +189,13 @@ pub fn backward(isa: Isa, grid: Grid, x: &[f32], source: GradientSource, target:
         winograd::gradient::<TILE>(isa, grid, x, dy, dweight, dbias);
     } else {
         if let Some(dx) = dx {
-            let axes = Axes::new(outputs, inputs, true);
-            thin::convolve(isa, grid, dy, 0, weight, axes, nothing, dx);
+            let operands = ThinConvolution {
+                grid,
+                source: dy,
+                weight,
+                axes: Axes::new(outputs, inputs, true),
+            };
+            thin::convolve(isa, operands, 0, nothing, dx);
         }
         thin::gradient(isa, grid, x, dy, dweight, dbias);
     }

@@ -16,6 +16,15 @@ use block::{BLOCK, PaddedRows, SIDE, blends_of, kernels_of};
 
 pub use block::{COLORS, TAPS};
 
+/// Images, and the logits of the kernels that filter them.
+#[derive(Clone, Copy, Debug)]
+pub struct Filter<'a> {
+    /// Images.
+    pub x: &'a [f32],
+    /// Logits.
+    pub logits: &'a [f32],
+}
+
 /// Filters each pixel with its own 5x5 kernel: the softmax of its first 25 logits. The image's
 /// border is replicated. A 26th logit becomes a fourth channel, its sigmoid.
 ///
@@ -27,7 +36,8 @@ pub use block::{COLORS, TAPS};
 ///
 /// # Panics
 /// If a length does not match the others.
-pub fn forward(isa: Isa, grid: Grid, x: &[f32], logits: &[f32], y: &mut [f32]) {
+pub fn forward(isa: Isa, grid: Grid, filter: Filter, y: &mut [f32]) {
+    let Filter { x, logits } = filter;
     let shape = Shape::of(grid, logits.len());
     let (pixels, sharing) = (grid.height * grid.width, shape.sharing(grid, x.len()));
     assert_eq!(
@@ -45,7 +55,7 @@ pub fn forward(isa: Isa, grid: Grid, x: &[f32], logits: &[f32], y: &mut [f32]) {
         .zip(y.chunks_mut(sharing * pixels * shape.outputs));
     for ((x, logits), y) in images {
         let y = y.chunks_mut(pixels * shape.outputs).collect();
-        forward_rows(isa, grid, x, 0..grid.height, logits, y);
+        forward_rows(isa, grid, Filter { x, logits }, 0..grid.height, y);
     }
 }
 
@@ -56,14 +66,8 @@ pub fn forward(isa: Isa, grid: Grid, x: &[f32], logits: &[f32], y: &mut [f32]) {
 ///
 /// # Panics
 /// If a length does not match the others.
-pub fn forward_rows(
-    isa: Isa,
-    grid: Grid,
-    x: &[f32],
-    rows: Range<usize>,
-    logits: &[f32],
-    y: Vec<&mut [f32]>,
-) {
+pub fn forward_rows(isa: Isa, grid: Grid, filter: Filter, rows: Range<usize>, y: Vec<&mut [f32]>) {
+    let Filter { x, logits } = filter;
     let band = Grid {
         batch: 1,
         height: rows.len(),
@@ -93,8 +97,8 @@ pub fn forward_rows(
     let single = Grid { batch: 1, ..grid };
     tasks::each(pieces, |(start, logits, y)| {
         let rows = start..start + logits.len() / row;
-        let images = x.chunks(single.pixels() * COLORS);
-        let images: Vec<PaddedRows> = images
+        let images: Vec<PaddedRows> = x
+            .chunks(single.pixels() * COLORS)
             .map(|x| PaddedRows::new(single, x, rows.clone()))
             .collect();
         let leaf = Forward {
@@ -115,7 +119,8 @@ pub fn forward_rows(
 ///
 /// # Panics
 /// If a length does not match the others.
-pub fn backward(isa: Isa, grid: Grid, x: &[f32], logits: &[f32], dy: &[f32], dlogits: &mut [f32]) {
+pub fn backward(isa: Isa, grid: Grid, filter: Filter, dy: &[f32], dlogits: &mut [f32]) {
+    let Filter { x, logits } = filter;
     let shape = Shape::of(grid, logits.len());
     assert_eq!(
         grid.channels(x.len()),
@@ -138,8 +143,11 @@ pub fn backward(isa: Isa, grid: Grid, x: &[f32], logits: &[f32], dy: &[f32], dlo
         .zip(dy.chunks(pixels * shape.outputs))
         .zip(dlogits.chunks_mut(pixels * shape.logits));
     let pieces = images.flat_map(|(((x, logits), dy), dlogits)| {
-        let bands = logits.chunks(step * row).zip(dy.chunks(step * out_row));
-        let bands = bands.zip(dlogits.chunks_mut(step * row)).enumerate();
+        let bands = logits
+            .chunks(step * row)
+            .zip(dy.chunks(step * out_row))
+            .zip(dlogits.chunks_mut(step * row))
+            .enumerate();
         bands.map(move |(piece, ((logits, dy), dlogits))| (x, piece * step, logits, dy, dlogits))
     });
     tasks::each(pieces, |(x, start, logits, dy, dlogits)| {

@@ -22,7 +22,11 @@ fn it_is_the_plain_sum_on_every_path() {
             let expected = reference::filter5x5(grid, &f64s(&x), &f64s(&logits));
             for isa in Isa::available() {
                 let mut y = vec![f32::NAN; expected.len()];
-                forward(isa, grid, &x, &logits, &mut y);
+                let filter = Filter {
+                    x: &x,
+                    logits: &logits,
+                };
+                forward(isa, grid, filter, &mut y);
                 assert_close(&format!("{isa} {grid:?}"), &y, &expected);
             }
         }
@@ -39,7 +43,11 @@ fn images_that_share_kernels_are_filtered_as_each_alone() {
             let (logits, outputs) = (logits(grid, channels), COLORS + channels - TAPS);
             for isa in Isa::available() {
                 let mut y = vec![f32::NAN; sharing * grid.pixels() * outputs];
-                forward(isa, grid, &x, &logits, &mut y);
+                let filter = Filter {
+                    x: &x,
+                    logits: &logits,
+                };
+                forward(isa, grid, filter, &mut y);
                 let mut alone = y.clone();
                 let single = Grid { batch: 1, ..grid };
                 let images = x.chunks(pixels * COLORS);
@@ -48,7 +56,7 @@ fn images_that_share_kernels_are_filtered_as_each_alone() {
                     alone.fill(f32::NAN);
                     let first = image / sharing * pixels * channels;
                     let logits = &logits[first..first + pixels * channels];
-                    forward(isa, single, x, logits, alone);
+                    forward(isa, single, Filter { x, logits }, alone);
                 }
                 assert_eq!(bits(&y), bits(&alone), "{isa} {grid:?} {channels}");
             }
@@ -68,7 +76,11 @@ fn the_gradient_is_that_of_differences() {
             y.iter().zip(&dy).map(|(y, dy)| y * f64::from(*dy)).sum()
         };
         let mut found = vec![f32::NAN; logits.len()];
-        backward(Isa::current(), grid, &x, &logits, &dy, &mut found);
+        let filter = Filter {
+            x: &x,
+            logits: &logits,
+        };
+        backward(Isa::current(), grid, filter, &dy, &mut found);
         let step = (logits.len() / 300).max(1);
         for i in (0..logits.len()).step_by(step) {
             let mut moved = f64s(&logits);
@@ -92,10 +104,14 @@ fn bits_depend_neither_on_the_path_nor_on_the_threads_nor_on_bands() {
     let x = pattern(grid.pixels() * COLORS, 1);
     let logits = logits(grid, TAPS + 1);
     let dy = pattern(grid.pixels() * (COLORS + 1), 3);
+    let filter = Filter {
+        x: &x,
+        logits: &logits,
+    };
     let work = |isa| {
         let (mut y, mut d) = (vec![0.0; dy.len()], vec![0.0; logits.len()]);
-        forward(isa, grid, &x, &logits, &mut y);
-        backward(isa, grid, &x, &logits, &dy, &mut d);
+        forward(isa, grid, filter, &mut y);
+        backward(isa, grid, filter, &dy, &mut d);
         (bits(&y), bits(&d))
     };
     for isa in Isa::available() {
@@ -104,14 +120,16 @@ fn bits_depend_neither_on_the_path_nor_on_the_threads_nor_on_bands() {
     }
     let image = grid.height * grid.width;
     let (mut whole, mut band) = (vec![0.0; dy.len()], vec![0.0; 20 * grid.width * 4]);
-    forward(Isa::current(), grid, &x, &logits, &mut whole);
+    forward(Isa::current(), grid, filter, &mut whole);
     let rows = 7 * grid.width..27 * grid.width;
     forward_rows(
         Isa::current(),
         Grid { batch: 1, ..grid },
-        &x[..image * COLORS],
+        Filter {
+            x: &x[..image * COLORS],
+            logits: &logits[rows.start * (TAPS + 1)..rows.end * (TAPS + 1)],
+        },
         7..27,
-        &logits[rows.start * (TAPS + 1)..rows.end * (TAPS + 1)],
         vec![&mut band],
     );
     assert_eq!(bits(&band), bits(&whole[rows.start * 4..rows.end * 4]));
@@ -128,8 +146,10 @@ fn a_flat_image_stays_flat_and_extreme_logits_select_one_pixel() {
     forward(
         Isa::current(),
         grid,
-        &[0.7; 72],
-        &logits(grid, TAPS),
+        Filter {
+            x: &[0.7; 72],
+            logits: &logits(grid, TAPS),
+        },
         &mut y,
     );
     assert!(y.iter().all(|y| (y - 0.7).abs() < 1e-6));
@@ -140,9 +160,17 @@ fn a_flat_image_stays_flat_and_extreme_logits_select_one_pixel() {
         .skip(TAPS / 2)
         .step_by(TAPS)
         .for_each(|logit| *logit = 1000.0);
-    forward(Isa::current(), grid, &x, &centre, &mut y);
+    let filter = Filter {
+        x: &x,
+        logits: &centre,
+    };
+    forward(Isa::current(), grid, filter, &mut y);
     assert_eq!(y, x);
     centre[0] = f32::NAN;
-    forward(Isa::current(), grid, &x, &centre, &mut y);
+    let filter = Filter {
+        x: &x,
+        logits: &centre,
+    };
+    forward(Isa::current(), grid, filter, &mut y);
     assert!(y[..COLORS].iter().all(|y| y.is_nan()) && y[COLORS..].iter().all(|y| y.is_finite()));
 }

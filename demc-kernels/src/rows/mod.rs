@@ -11,7 +11,7 @@ mod outer;
 use rayon::prelude::*;
 
 use crate::Isa;
-use crate::product::{Left, Panels, Right, padded_rows, product};
+use crate::product::{Left, Panels, Right, Size, Target, padded_rows, product};
 use crate::scratch::{Scratch, Shared};
 use crate::simd::{Leaf, Simd, run};
 
@@ -160,17 +160,17 @@ impl Leaf for Sum<'_> {
                     k_step: 1,
                 };
                 let b = Right::Packed(values.as_ptr());
-                let c = self.c.as_mut_ptr();
-                product::<S>(
-                    self.count,
-                    *depth,
-                    *columns,
-                    a,
-                    b,
-                    c,
-                    self.c_step,
-                    self.add || index > 0,
-                );
+                let size = Size {
+                    rows: self.count,
+                    depth: *depth,
+                    columns: *columns,
+                };
+                let c = Target {
+                    start: self.c.as_mut_ptr(),
+                    step: self.c_step,
+                    accumulate: self.add || index > 0,
+                };
+                product::<S>(size, a, b, c);
             }
         }
     }

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use crate::Isa;
-use crate::product::{Left, ROW_BLOCK, Right, padded_rows, product};
+use crate::product::{Left, ROW_BLOCK, Right, Size, Target, padded_rows, product};
 use crate::scratch::{Scratch, Shared};
 use crate::simd::{Leaf, Simd, run};
 
@@ -76,17 +76,17 @@ impl Leaf for Reduce<'_> {
                     start: b.as_ptr().add(pixel * b_step),
                     step: b_step,
                 };
-                let c = self.c.pointer().add(self.first * self.c_step);
-                product::<S>(
-                    self.count,
+                let size = Size {
+                    rows: self.count,
                     depth,
                     columns,
-                    left,
-                    right,
-                    c,
-                    self.c_step,
-                    self.add || pixel > 0,
-                );
+                };
+                let target = Target {
+                    start: self.c.pointer().add(self.first * self.c_step),
+                    step: self.c_step,
+                    accumulate: self.add || pixel > 0,
+                };
+                product::<S>(size, left, right, target);
             }
         }
     }

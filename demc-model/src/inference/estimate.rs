@@ -242,8 +242,10 @@ impl PeakEstimate<'_> {
             (0, self.images() + count * self.input(0))
         };
         for level in first..LEVELS {
-            let held = self.skip_sources() + self.kept_color();
-            let held = held + self.sums(0..level + 1) + count * self.input(level);
+            let held = self.skip_sources()
+                + self.kept_color()
+                + self.sums(0..level + 1)
+                + count * self.input(level);
             let grid = self.grid_of(level);
             let working = if level <= DEEPEST_BANDED && banded(level) {
                 let bands = 3 * self.rows(level, self.plan.band + 2 * WAITING_ROWS);

@@ -132,8 +132,11 @@ impl InferencePass<'_> {
         let folded = folded_level(level);
         let prepared = self.prepare_level(level, &folded);
         let [_, skip_fusion] = &folded;
-        let conv = decoder.head.iter();
-        let conv: Vec<FoldedConv> = conv.map(|conv| FoldedConv::conv(conv, None)).collect();
+        let conv: Vec<FoldedConv> = decoder
+            .head
+            .iter()
+            .map(|conv| FoldedConv::conv(conv, None))
+            .collect();
         let mut output = match kernel_head {
             Some(head) => OutputRows::Kernels {
                 filtered: head.filtered(0),

@@ -5,8 +5,10 @@ use std::ops::Range;
 
 use burn::backend::flex::FlexTensor;
 use burn::tensor::Tensor;
+use demc_kernels::blend::{self, Scales};
 use demc_kernels::conv1x1::{Epilogue, Part, forward_part};
-use demc_kernels::{Grid, Isa, blend, filter5x5, grid, memory, power};
+use demc_kernels::filter5x5::{self, Filter};
+use demc_kernels::{Grid, Isa, grid, memory, power};
 use rayon::prelude::*;
 
 use super::band::bands;
@@ -109,7 +111,8 @@ impl KernelHead {
             ..scale.grid
         };
         let targets = filtered.rows_of_images_mut(images, rows.clone());
-        filter5x5::forward_rows(self.isa, grid, x, rows, &logits, targets);
+        let filter = Filter { x, logits: &logits };
+        filter5x5::forward_rows(self.isa, grid, filter, rows, targets);
     }
 
     /// Completes a level: blends the filtered image with the output so far.
@@ -118,8 +121,11 @@ impl KernelHead {
             None => filtered,
             Some(coarse) => {
                 let mut out = FeatureMaps::new(filtered.grid, COLOR_CHANNELS);
-                let values = (&filtered.values, &coarse.values);
-                blend::forward(filtered.grid, values.0, values.1, &mut out.values);
+                let scales = Scales {
+                    filtered: &filtered.values,
+                    coarse: &coarse.values,
+                };
+                blend::forward(filtered.grid, scales, &mut out.values);
                 out
             }
         });

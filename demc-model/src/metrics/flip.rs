@@ -37,14 +37,14 @@ pub fn flip(candidate: &Image, reference: &Image) -> f64 {
     let errors: Vec<f32> = colors
         .zip(features)
         .map(|((&x, &y), (&[edge_x, point_x], &[edge_y, point_y]))| {
-            let color = hyab(x, y).powf(COLOR_POWER);
-            let color = if color < knee {
-                color * KNEE_VALUE / knee
+            let distance = hyab(x, y).powf(COLOR_POWER);
+            let color = if distance < knee {
+                distance * KNEE_VALUE / knee
             } else {
-                KNEE_VALUE + (color - knee) / (largest - knee) * (1.0 - KNEE_VALUE)
+                KNEE_VALUE + (distance - knee) / (largest - knee) * (1.0 - KNEE_VALUE)
             };
-            let feature = (edge_x - edge_y).abs().max((point_x - point_y).abs());
-            let feature = (feature / 2.0_f32.sqrt()).sqrt();
+            let difference = (edge_x - edge_y).abs().max((point_x - point_y).abs());
+            let feature = (difference / 2.0_f32.sqrt()).sqrt();
             color.powf(1.0 - feature)
         })
         .collect();

@@ -23,8 +23,10 @@ pub fn ssim(candidate: &Image, reference: &Image) -> Option<f64> {
         return None;
     }
     let pixels = height * width;
-    let channels = candidate.display().chunks(pixels);
-    let channels = channels.zip(reference.display().chunks(pixels));
+    let channels = candidate
+        .display()
+        .chunks(pixels)
+        .zip(reference.display().chunks(pixels));
     let sum: f64 = channels.map(|(c, r)| ssim_plane(c, r, width)).sum();
     Some(sum / 3.0)
 }
@@ -35,8 +37,10 @@ pub fn ssim(candidate: &Image, reference: &Image) -> Option<f64> {
 /// If the sizes differ.
 pub fn psnr(candidate: &Image, reference: &Image) -> Option<f64> {
     candidate.assert_size_of(reference);
-    let rows = candidate.display().par_chunks(candidate.size().1);
-    let rows = rows.zip(reference.display().par_chunks(candidate.size().1));
+    let rows = candidate
+        .display()
+        .par_chunks(candidate.size().1)
+        .zip(reference.display().par_chunks(candidate.size().1));
     let squares = |(c, r): (&[f64], &[f64])| c.iter().zip(r).map(|(c, r)| (c - r).powi(2)).sum();
     // Summed in order, so that the result does not depend on the number of threads.
     let row_sums: Vec<f64> = rows.map(squares).collect();

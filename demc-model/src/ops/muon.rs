@@ -77,8 +77,11 @@ fn orthogonal(x: Tensor<2>, length: f64) -> Tensor<2> {
     if rows > columns {
         return orthogonal(x.transpose(), length).transpose();
     }
-    let norm = (x.clone() * x.clone()).sum().sqrt();
-    let norm = norm.clamp_min(LEAST_NORM).unsqueeze::<2>();
+    let norm = (x.clone() * x.clone())
+        .sum()
+        .sqrt()
+        .clamp_min(LEAST_NORM)
+        .unsqueeze::<2>();
     let x = x / norm;
     let identity = Tensor::<2>::eye(rows, &x.device());
     let [a, b, c] = COEFFICIENTS;

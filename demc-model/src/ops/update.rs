@@ -138,8 +138,10 @@ pub fn sum_of_squares(ops: Ops, tensors: Vec<Tensor<1>>) -> f64 {
         Ops::Burn => {
             // One transfer to the host for all tensors, where their sums are added in float64.
             let sums = tensors.into_iter().map(|tensor| tensor.square().sum());
-            let sums = Tensor::cat(sums.collect(), 0).into_data();
-            let sums = sums.try_to_vec::<f32>().expect("gradients are float32");
+            let sums = Tensor::cat(sums.collect(), 0)
+                .into_data()
+                .try_to_vec::<f32>()
+                .expect("gradients are float32");
             sums.into_iter().map(f64::from).sum()
         }
     }

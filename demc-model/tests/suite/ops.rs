@@ -248,8 +248,7 @@ fn loss_agrees_with_burn() {
             let reference = random.tensor(shape, &device()).clamp_min(0.0) * 3.0;
             // Half of the loss, as with gradient accumulation.
             let config = LossConfig::default();
-            let loss = config.per_image(ops, output.clone(), reference, 2.2);
-            let loss = loss.mean() / 2.0;
+            let loss = config.per_image(ops, output.clone(), reference, 2.2).mean() / 2.0;
             let gradients = loss.backward();
             let gradient = output.grad(&gradients).expect("a gradient of the output");
             vec![

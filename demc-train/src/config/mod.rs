@@ -153,8 +153,7 @@ impl Config {
 
     /// The paths by key.
     fn paths(&self) -> impl Iterator<Item = (&'static str, &Path)> {
-        let optional = [("run.dir", &self.run.dir), ("train.init", &self.train.init)];
-        let optional = optional.into_iter();
+        let optional = [("run.dir", &self.run.dir), ("train.init", &self.train.init)].into_iter();
         let set = optional.filter_map(|(key, path)| Some((key, path.as_deref()?)));
         set.chain([("data.root", self.data.root.as_path())])
     }

@@ -145,9 +145,9 @@ fn check_key(path: &str, keys: &BTreeSet<String>) -> Result<(), String> {
         .filter(|key| key.starts_with(&prefix))
         .map(String::as_str)
         .collect();
-    let inside = inside.join(", ");
     Err(format!(
-        "`{path}` is a table; set one of its keys: {inside}"
+        "`{path}` is a table; set one of its keys: {}",
+        inside.join(", ")
     ))
 }
 

@@ -196,11 +196,13 @@ fn demc_toml_lists_every_key_with_its_default() {
         let is_set = tables[outer].get(inner).is_some();
         assert!(is_set || comments.contains(&key), "{key}");
     }
-    let with_comments = text.lines().map(|line| match line.strip_prefix("# ") {
-        Some(set) if set.contains(" = ") => set,
-        _ => line,
-    });
-    let with_comments: Vec<&str> = with_comments.collect();
+    let with_comments: Vec<&str> = text
+        .lines()
+        .map(|line| match line.strip_prefix("# ") {
+            Some(set) if set.contains(" = ") => set,
+            _ => line,
+        })
+        .collect();
     toml::from_str::<Config>(&with_comments.join("\n")).expect("comments are valid settings too");
 }
 

@@ -86,12 +86,14 @@ fn as_count(count: usize) -> i32 {
 
 /// Counts and start positions of consecutive parts.
 fn parts(counts: &[usize]) -> (Vec<i32>, Vec<i32>) {
-    let starts = counts.iter().scan(0, |end, count| {
-        let start = *end;
-        *end += count;
-        Some(as_count(start))
-    });
-    let starts = starts.collect();
+    let starts = counts
+        .iter()
+        .scan(0, |end, count| {
+            let start = *end;
+            *end += count;
+            Some(as_count(start))
+        })
+        .collect();
     (
         counts.iter().map(|count| as_count(*count)).collect(),
         starts,
@@ -118,8 +120,8 @@ impl Group {
             communicator,
             nodes: Vec::new(),
         };
-        let nodes = group.gather_bytes(node().as_bytes());
-        let nodes = nodes.iter().map(|name| String::from_utf8_lossy(name));
+        let names = group.gather_bytes(node().as_bytes());
+        let nodes = names.iter().map(|name| String::from_utf8_lossy(name));
         group.nodes = nodes.map(|name| name.into_owned()).collect();
         Some(group)
     }

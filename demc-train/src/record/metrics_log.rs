@@ -112,8 +112,12 @@ impl MetricsLog {
             Vec::new()
         };
         let StoredLines { lines, damaged } = read_lines::<LineStep>(&bytes);
-        let kept = lines.iter().filter(|(_, line)| line.step <= step);
-        let kept: Vec<u8> = kept.flat_map(|(text, _)| *text).copied().collect();
+        let kept: Vec<u8> = lines
+            .iter()
+            .filter(|(_, line)| line.step <= step)
+            .flat_map(|(text, _)| *text)
+            .copied()
+            .collect();
         if kept.len() != bytes.len() {
             write_whole(path, |file| file.write_all(&kept))?;
         }

@@ -126,8 +126,9 @@ impl TrainingData {
         let layout = ChannelLayout::resolve(layout)?;
         let dataset = Dataset::open(root, &layout)?;
         let (train, validation) = dataset.train_validation(*validation, config.train.seed)?;
-        let test = dataset.scenes.iter();
-        let test: Vec<Scene> = test
+        let test: Vec<Scene> = dataset
+            .scenes
+            .iter()
             .filter(|scene| scene.split == Split::Test)
             .cloned()
             .collect();
@@ -235,8 +236,8 @@ impl TrainingData {
             (&self.train, "training"),
             (&self.validation, "validation"),
             (&self.test, "test"),
-        ];
-        let counts = counts.map(|(scenes, split)| {
+        ]
+        .map(|(scenes, split)| {
             let plural = if scenes.len() == 1 { "" } else { "s" };
             format!("{} {split} scene{plural}", scenes.len())
         });

@@ -138,22 +138,26 @@ impl RunRecord {
     pub fn check_scenes(&self, path: &Path, data: &TrainingData) -> anyhow::Result<()> {
         let now = SceneNames::of(data);
         let (then, now_entries) = (self.scenes.entries(), now.entries());
-        let moved: BTreeSet<&str> = then
+        let mut moved: Vec<&str> = then
             .symmetric_difference(&now_entries)
             .map(|(name, _)| *name)
             .collect();
-        let moved: Vec<&str> = moved.into_iter().collect();
+        moved.dedup();
         ensure!(
             moved.is_empty(),
             "{}: the run started with different scenes or splits: {}; restore the data set, or start a new run",
             path.display(),
             short_list(&moved)
         );
-        let changed = data.checksums.iter().filter(|(name, sum)| {
-            let before = self.checksums.get(*name);
-            before.is_some_and(|before| before != *sum)
-        });
-        let changed: Vec<&str> = changed.map(|(name, _)| name.as_str()).collect();
+        let changed: Vec<&str> = data
+            .checksums
+            .iter()
+            .filter(|(name, sum)| {
+                let before = self.checksums.get(*name);
+                before.is_some_and(|before| before != *sum)
+            })
+            .map(|(name, _)| name.as_str())
+            .collect();
         ensure!(
             changed.is_empty(),
             "{}: files of scenes changed since the run started: {}; restore them, or start a new run",
@@ -199,8 +203,9 @@ impl RunRecord {
 
 fn burn_version() -> String {
     let manifest: toml::Table = MANIFEST.parse().expect("the manifest that Cargo read");
-    let pinned = manifest["workspace"]["dependencies"]["burn"]["version"].as_str();
-    let pinned = pinned.and_then(|version| version.strip_prefix('='));
+    let pinned = manifest["workspace"]["dependencies"]["burn"]["version"]
+        .as_str()
+        .and_then(|version| version.strip_prefix('='));
     pinned.expect("Burn is pinned").to_string()
 }
 

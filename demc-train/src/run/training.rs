@@ -137,8 +137,12 @@ impl TrainingRun {
         let mut recorder = self.open_records(device)?;
         let (train, run) = (self.config.train.clone(), self.config.run.clone());
         let rate = self.config.learning_rate();
-        let scenes = self.data.train.iter();
-        let scenes: Vec<String> = scenes.map(|scene| scene.name.clone()).collect();
+        let scenes: Vec<String> = self
+            .data
+            .train
+            .iter()
+            .map(|scene| scene.name.clone())
+            .collect();
         let per_step = train.grad_accumulation;
         let share = self.reduce.share(per_step);
         let mut loader = share_loader(self.source.clone(), share, per_step, self.state.step);
@@ -262,8 +266,10 @@ impl TrainingRun {
             patches: self.source.patches().len() as u64,
             scenes,
         };
-        let patches = report.patches.iter();
-        let patches = patches.map(|(patch, loss)| (patch.scene as usize, *loss));
+        let patches = report
+            .patches
+            .iter()
+            .map(|(patch, loss)| (patch.scene as usize, *loss));
         Ok(self.state.watch.step(facts, report.loss, patches))
     }
 
@@ -295,8 +301,11 @@ impl TrainingRun {
             return Ok(());
         }
         let bundle = self.bundle(self.trainer.model().valid());
-        let average = self.trainer.average();
-        let average = average.cloned().map(|model| self.bundle(model));
+        let average = self
+            .trainer
+            .average()
+            .cloned()
+            .map(|model| self.bundle(model));
         checkpoint::save(
             self.dir.path(),
             &bundle,

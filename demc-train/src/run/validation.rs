@@ -99,8 +99,10 @@ fn score_scene(bundle: &Bundle, scene: &Scene, draws: bool) -> anyhow::Result<Sc
 
 /// The validation of these scenes.
 fn whole(mut scenes: Vec<SceneResult>) -> Validation {
-    let pictures = scenes.iter_mut().filter_map(|scene| scene.picture.take());
-    let pictures: Vec<Picture> = pictures.collect();
+    let pictures: Vec<Picture> = scenes
+        .iter_mut()
+        .filter_map(|scene| scene.picture.take())
+        .collect();
     let sum = |of: fn(&SceneResult) -> usize| scenes.iter().map(of).sum::<usize>();
     let limit = DEAD * sum(|scene| scene.pixels) as f64;
     let is_dead = |channel: &usize| {

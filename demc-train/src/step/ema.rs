@@ -71,8 +71,8 @@ impl ModuleMapper for EmaUpdate {
         let live = self
             .live
             .pop_front()
-            .expect("two networks with the same configuration");
-        let live = live.reshape(average.dims());
+            .expect("two networks with the same configuration")
+            .reshape(average.dims());
         let average = moving_average(self.ops, average, live, self.share);
         Param::from_mapped_value(id, average, mapper)
     }

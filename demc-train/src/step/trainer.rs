@@ -114,8 +114,10 @@ impl Trainer {
             device.is_autodiff(),
             "training needs a device with autodiff"
         );
-        let ema = config.train.ema_decay;
-        let ema = ema.map(|decay| Ema::new(decay, average.unwrap_or_else(|| model.valid())));
+        let ema = config
+            .train
+            .ema_decay
+            .map(|decay| Ema::new(decay, average.unwrap_or_else(|| model.valid())));
         Trainer {
             model: Some(model),
             optimizer,
@@ -238,8 +240,7 @@ impl Trainer {
             .clone()
             .mean()
             .div_scalar(self.grad_accumulation as f32);
-        let losses = tensor.into_data().try_to_vec::<f32>();
-        let losses = losses.expect("losses are float32");
+        let losses: Vec<f32> = tensor.into_data().try_to_vec().expect("losses are float32");
         assert_eq!(patches.len(), losses.len(), "a place for each loss");
         if losses.iter().all(|loss| loss.is_finite()) {
             let model = self.model();
@@ -283,11 +284,11 @@ impl Trainer {
         {
             grads = scaled(self.model(), grads, limit / norm);
         }
-        let model = self
+        let before = self
             .model
             .take()
             .expect("the network is taken only within a step");
-        let model = self.optimizer.step(lr, model, grads);
+        let model = self.optimizer.step(lr, before, grads);
         if let Some(ema) = &mut self.ema {
             ema.update(&model.valid(), self.optimizer.steps());
         }

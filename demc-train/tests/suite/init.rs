@@ -141,8 +141,10 @@ fn the_albedo_filter_of_the_first_run_is_kept() {
         if file.ends_with("optimizer.safetensors") {
             continue;
         }
-        let found = Bundle::load(&whole.join(file), &Device::flex()).expect(file);
-        let found = found.albedo_filter.expect("a filter");
+        let found = Bundle::load(&whole.join(file), &Device::flex())
+            .expect(file)
+            .albedo_filter
+            .expect("a filter");
         assert_eq!(found.meta, filter.meta, "{file}");
         assert_eq!(found.model.weights(), filter.model.weights(), "{file}");
     }

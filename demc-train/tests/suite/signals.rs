@@ -39,8 +39,9 @@ fn wait_for_a_line(child: &mut Child, run: &Path) {
 }
 
 fn newest(run: &Path) -> Option<u64> {
-    let names = std::fs::read_dir(run.join("checkpoints")).ok()?;
-    let names = names.map(|entry| entry.expect("an entry").file_name());
+    let names = std::fs::read_dir(run.join("checkpoints"))
+        .ok()?
+        .map(|entry| entry.expect("an entry").file_name());
     let steps = names.filter_map(|name| name.to_string_lossy().strip_prefix("step-")?.parse().ok());
     steps.max()
 }

@@ -109,8 +109,8 @@ fn hex(bytes: &[u8]) -> String {
 }
 
 fn read(python: &str, run: &Path) -> Value {
-    let output = run_python(python, [READER.as_ref(), run.as_os_str()]);
-    let output = output.expect("Python, which ran before");
+    let output =
+        run_python(python, [READER.as_ref(), run.as_os_str()]).expect("Python, which ran before");
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{stderr}");
     serde_json::from_slice(&output.stdout).expect("JSON")

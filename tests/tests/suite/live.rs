@@ -141,8 +141,9 @@ pub fn random_bundle(
         flat_color: [0.5, 0.4, 0.3],
     };
     let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
-    let model = config.load(&mut Weights::new(weights), &device);
-    let model = model.expect("its own weights");
+    let model = config
+        .load(&mut Weights::new(weights), &device)
+        .expect("its own weights");
     Bundle::new(BundleMeta::new(config, normalizer, layout, 0), model)
 }
 

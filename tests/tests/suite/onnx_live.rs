@@ -56,36 +56,9 @@ fn onnx_runtime_computes_what_this_program_does() {
     // New weights and inputs in each run; every failure names the seed.
     let seed: u64 = rand::random();
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let folder = TempDir::new().expect("a temporary directory");
-    let folder = folder.path();
-
-    let mut bundles: Vec<(String, Bundle)> = Vec::new();
-    for variant in Variant::ALL {
-        for reading in Reading::ALL {
-            let bundle = random_bundle(variant, reading, -0.05..0.06, &mut rng);
-            let bundle = scaled(&bundle, &mut rng);
-            for (precision, suffix) in PRECISIONS {
-                let [variant, reading] = [variant.spec().name, reading.spec().name];
-                let name = format!("{variant}-{reading}-{suffix}");
-                let path = folder.join(&name).with_extension("onnx");
-                bundle.export_onnx(&path, precision).expect("exported");
-                bundles.push((name, bundle.rounded(precision).expect("rounded")));
-            }
-        }
-    }
-    // Networks of earlier cases as albedo filters of each other.
-    let count = bundles.len();
-    for (i, filter) in [(0, count - 2), (1, count - 1), (count - 4, 0)] {
-        let (name, mut bundle) = bundles[i].clone();
-        let filter = bundles[filter].1.clone();
-        bundle
-            .set_albedo_filter(filter)
-            .expect("the same positions");
-        let name = format!("{name}-filter");
-        let path = folder.join(&name).with_extension("onnx");
-        bundle.export_onnx(&path, Precision::F32).expect("exported");
-        bundles.push((name, bundle));
-    }
+    let temporary = TempDir::new().expect("a temporary directory");
+    let folder = temporary.path();
+    let bundles = exported(folder, &mut rng);
     let frames: Vec<Vec<Frame>> = SIZES
         .iter()
         .map(|size| frames(*size, &bundles[0].1, &mut rng))
@@ -110,30 +83,68 @@ fn onnx_runtime_computes_what_this_program_does() {
     );
 
     for (name, bundle) in &bundles {
-        let mut worst = [0.0f32; 2];
-        let (mut lit, mut total) = (0, 0);
-        for (case, frames) in frames.iter().enumerate() {
-            let what = format!("{name}, {:?}, seed {seed}", SIZES[case]);
-            let expected: Vec<f32> = frames
-                .iter()
-                .flat_map(|frame| bundle.denoise(frame).expect("denoised"))
-                .collect();
-            // Over all sizes: a small image may be dark although the image in `scaled` is not.
-            lit += expected.iter().filter(|&&v| v > 1e-3).count();
-            total += expected.len();
-            let found = read_floats(&folder.join(format!("{name}.{case}.output")));
-            for (worst, tolerance) in worst.iter_mut().zip([OF_LARGEST, OF_VALUE]) {
-                let share = assert_close(&what, &found, &expected, tolerance);
-                *worst = worst.max(1e-4 * share);
+        compare(folder, name, bundle, &frames, seed);
+    }
+}
+
+/// Networks of all variants, readings, and precisions, and some with albedo filters. Each is written to
+/// the folder as ONNX.
+fn exported(folder: &Path, rng: &mut ChaCha8Rng) -> Vec<(String, Bundle)> {
+    let mut bundles: Vec<(String, Bundle)> = Vec::new();
+    for variant in Variant::ALL {
+        for reading in Reading::ALL {
+            let random = random_bundle(variant, reading, -0.05..0.06, rng);
+            let bundle = scaled(&random, rng);
+            for (precision, suffix) in PRECISIONS {
+                let [variant, reading] = [variant.spec().name, reading.spec().name];
+                let name = format!("{variant}-{reading}-{suffix}");
+                let path = folder.join(&name).with_extension("onnx");
+                bundle.export_onnx(&path, precision).expect("exported");
+                bundles.push((name, bundle.rounded(precision).expect("rounded")));
             }
         }
-        assert!(
-            lit > total / 2,
-            "{name}, seed {seed}: only {lit} of {total} values are lit"
-        );
-        let [of_largest, of_value] = worst;
-        println!("{name}: {of_largest:.1e} of the largest value, {of_value:.1e} of each");
     }
+    // Networks of earlier cases as albedo filters of each other.
+    let count = bundles.len();
+    for (i, filter) in [(0, count - 2), (1, count - 1), (count - 4, 0)] {
+        let (name, mut bundle) = bundles[i].clone();
+        let filter = bundles[filter].1.clone();
+        bundle
+            .set_albedo_filter(filter)
+            .expect("the same positions");
+        let name = format!("{name}-filter");
+        let path = folder.join(&name).with_extension("onnx");
+        bundle.export_onnx(&path, Precision::F32).expect("exported");
+        bundles.push((name, bundle));
+    }
+    bundles
+}
+
+/// Compares the outputs of ONNX Runtime in the folder with those of the bundle.
+fn compare(folder: &Path, name: &str, bundle: &Bundle, frames: &[Vec<Frame>], seed: u64) {
+    let mut worst = [0.0f32; 2];
+    let (mut lit, mut total) = (0, 0);
+    for (case, frames) in frames.iter().enumerate() {
+        let what = format!("{name}, {:?}, seed {seed}", SIZES[case]);
+        let expected: Vec<f32> = frames
+            .iter()
+            .flat_map(|frame| bundle.denoise(frame).expect("denoised"))
+            .collect();
+        // Over all sizes: a small image may be dark although the image in `scaled` is not.
+        lit += expected.iter().filter(|&&v| v > 1e-3).count();
+        total += expected.len();
+        let found = read_floats(&folder.join(format!("{name}.{case}.output")));
+        for (worst, tolerance) in worst.iter_mut().zip([OF_LARGEST, OF_VALUE]) {
+            let share = assert_close(&what, &found, &expected, tolerance);
+            *worst = worst.max(1e-4 * share);
+        }
+    }
+    assert!(
+        lit > total / 2,
+        "{name}, seed {seed}: only {lit} of {total} values are lit"
+    );
+    let [of_largest, of_value] = worst;
+    println!("{name}: {of_largest:.1e} of the largest value, {of_value:.1e} of each");
 }
 
 /// The network with a positive output convolution, scaled to a largest value of [`LARGEST`]. The

@@ -105,8 +105,11 @@ fn agrees(python: &Python, variant: Variant, reading: Reading, names: Names, pre
             &device,
         )
     };
-    let ours = model.forward(tensor(color_gamma, colors), tensor(features_z, FEATURES));
-    let ours: Vec<f32> = ours.into_data().try_to_vec().expect("float32");
+    let ours: Vec<f32> = model
+        .forward(tensor(color_gamma, colors), tensor(features_z, FEATURES))
+        .into_data()
+        .try_to_vec()
+        .expect("float32");
     let theirs = &read(&output)["output"];
     assert_eq!(theirs.shape, SHAPE, "{what}");
     let lit = theirs.data.iter().filter(|&&v| v > 0.1).count();

@@ -108,11 +108,10 @@ fn section(source: &Path) -> Result<String, cbindgen::Error> {
     bindings.write(&mut text);
     let text = String::from_utf8_lossy(&text).into_owned();
     // The type of the handle declares the object, too.
-    let blocks = text
+    let blocks: Vec<&str> = text
         .trim()
         .split("\n\n")
-        .filter(|block| !block.ends_with("Object;"));
-    let blocks: Vec<&str> = blocks.collect();
+        .filter(|block| !block.ends_with("Object;")).collect();
     // Marks of Rust's documentation.
     Ok(blocks
         .join("\n\n")

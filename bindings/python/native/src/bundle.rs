@@ -161,10 +161,13 @@ impl Inputs {
             let array = array.as_ref();
             array.map(|array| Array::new(name, array)).transpose()
         };
-        let features = FEATURES.into_iter().zip(features);
-        let features = features.map(|(name, array)| optional(name, array));
-        let layers = layers.iter();
-        let layers = layers.map(|(name, array)| Ok((name.clone(), Array::new(name, array)?)));
+        let features = FEATURES
+            .into_iter()
+            .zip(features)
+            .map(|(name, array)| optional(name, array));
+        let layers = layers
+            .iter()
+            .map(|(name, array)| Ok((name.clone(), Array::new(name, array)?)));
         Ok(Self {
             color: Array::new("color", color)?,
             features: features.collect::<PyResult<_>>()?,
@@ -183,9 +186,11 @@ impl Inputs {
         buffers.alpha = optional_view(&self.alpha)?;
         let frame = bundle.frame("image", &buffers)?;
         let size = [frame.height, frame.width];
-        let layers = self.layers.iter();
-        let layers = layers.map(|(name, array)| Layer::copied(name, &array.view()?, size));
-        let layers = layers.collect::<Result<_, _>>()?;
+        let layers = self
+            .layers
+            .iter()
+            .map(|(name, array)| Layer::copied(name, &array.view()?, size))
+            .collect::<Result<_, _>>()?;
         Ok((frame, layers))
     }
 }

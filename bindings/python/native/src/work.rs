@@ -96,10 +96,12 @@ pub fn run<M: Send, R: Send>(
             done
         };
         thread::scope(|scope| {
-            let worker = Builder::new().name("demc".into()).spawn_scoped(scope, work);
-            let worker = worker.map_err(|error| {
-                PyRuntimeError::new_err(format!("cannot start a thread: {error}"))
-            })?;
+            let worker = Builder::new()
+                .name("demc".into())
+                .spawn_scoped(scope, work)
+                .map_err(|error| {
+                    PyRuntimeError::new_err(format!("cannot start a thread: {error}"))
+                })?;
             let mut raised = None;
             loop {
                 let message = match messages.recv_timeout(SIGNAL_INTERVAL) {
@@ -153,8 +155,10 @@ fn check_process() -> PyResult<()> {
 
 /// The exception for a panic, which has printed its place on stderr.
 fn internal(panic: &(dyn Any + Send)) -> PyErr {
-    let text = panic.downcast_ref::<String>().map(String::as_str);
-    let text = text.or_else(|| panic.downcast_ref::<&str>().copied());
+    let text = panic
+        .downcast_ref::<String>()
+        .map(String::as_str)
+        .or_else(|| panic.downcast_ref::<&str>().copied());
     PyRuntimeError::new_err(format!(
         "internal error of demc: {}; please report it",
         text.unwrap_or("no message")

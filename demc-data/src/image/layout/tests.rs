@@ -101,22 +101,24 @@ fn unknown_keys_are_refused_with_their_line() {
 fn file(directory: &Path, parts: &[(&str, &[&str])]) -> ExrFile {
     use exr::prelude::*;
     let path = directory.join("file.exr");
-    let layers = parts.iter().map(|(part, names)| {
-        let channels = names
-            .iter()
-            .map(|name| AnyChannel::new(*name, FlatSamples::F32(vec![0.5; 4])));
-        let mut attributes = LayerAttributes::named(*part);
-        if part.is_empty() {
-            attributes.layer_name = None;
-        }
-        Layer::new(
-            (2, 2),
-            attributes,
-            Encoding::FAST_LOSSLESS,
-            AnyChannels::sort(channels.collect()),
-        )
-    });
-    let layers: Vec<_> = layers.collect();
+    let layers: Vec<_> = parts
+        .iter()
+        .map(|(part, names)| {
+            let channels = names
+                .iter()
+                .map(|name| AnyChannel::new(*name, FlatSamples::F32(vec![0.5; 4])));
+            let mut attributes = LayerAttributes::named(*part);
+            if part.is_empty() {
+                attributes.layer_name = None;
+            }
+            Layer::new(
+                (2, 2),
+                attributes,
+                Encoding::FAST_LOSSLESS,
+                AnyChannels::sort(channels.collect()),
+            )
+        })
+        .collect();
     let window = IntegerBounds::from_dimensions((2, 2));
     let image = Image::from_layers(ImageAttributes::new(window), layers);
     image.write().to_file(&path).expect("written");

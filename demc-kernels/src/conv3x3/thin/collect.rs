@@ -2,8 +2,9 @@
 
 use rayon::prelude::*;
 
+use super::ThinConvolution;
 use super::gather::neighbour;
-use crate::conv3x3::parts::{Axes, BiasRelu, GatedMap};
+use crate::conv3x3::parts::BiasRelu;
 use crate::product::padded_rows;
 use crate::rows::{self, BLOCK, Packed, Term, whole};
 use crate::scratch::Scratch;
@@ -11,17 +12,19 @@ use crate::simd::{Leaf, Simd, run};
 use crate::{Grid, Isa};
 
 /// Convolves by the values that each pixel contributes to its neighbours.
-#[allow(clippy::too_many_arguments, reason = "as `convolve`")]
 pub(super) fn collect(
     isa: Isa,
-    grid: Grid,
-    source: GatedMap,
+    operands: ThinConvolution,
     above: usize,
-    weight: &[f32],
-    axes: Axes,
     epilogue: BiasRelu,
     y: &mut [f32],
 ) {
+    let ThinConvolution {
+        grid,
+        source,
+        weight,
+        axes,
+    } = operands;
     let (depth, outputs) = (axes.inputs, axes.outputs);
     let columns = 9 * outputs;
     let b = Packed::new(isa, depth, columns, |k, column| {

@@ -25,22 +25,28 @@ use collect::collect;
 /// Maximum number of output values over all taps for which collecting pays off.
 const MOST_COLLECTED: usize = 36;
 
-/// `y = epilogue(weight * source)` for the rows from `above` on, as many as `y` has. `grid` is the grid
-/// of `source`.
+/// What a convolution reads, beside its epilogue.
+#[derive(Clone, Copy)]
+pub(crate) struct ThinConvolution<'a> {
+    /// Grid of `source`.
+    pub(crate) grid: Grid,
+    pub(crate) source: GatedMap<'a>,
+    pub(crate) weight: &'a [f32],
+    pub(crate) axes: Axes,
+}
+
+/// `y = epilogue(weight * source)` for the rows from `above` on, as many as `y` has.
 ///
 /// # Panics
 /// If there are several images and `y` does not have all their rows.
-#[allow(clippy::too_many_arguments, reason = "the operands of a convolution")]
 pub(crate) fn convolve(
     isa: Isa,
-    grid: Grid,
-    source: GatedMap,
+    operands: ThinConvolution,
     above: usize,
-    weight: &[f32],
-    axes: Axes,
     epilogue: BiasRelu,
     y: &mut [f32],
 ) {
+    let ThinConvolution { grid, axes, .. } = operands;
     let height = y.len() / (grid.batch * grid.width * axes.outputs);
     assert!(
         above + height <= grid.height,
@@ -52,31 +58,23 @@ pub(crate) fn convolve(
         "a band of a single image"
     );
     if 9 * axes.outputs <= MOST_COLLECTED && axes.inputs > axes.outputs {
-        collect(isa, grid, source, above, weight, axes, epilogue, y);
+        collect(isa, operands, above, epilogue, y);
     } else {
-        spread(isa, grid, source, above, weight, axes, epilogue, y);
+        spread(isa, operands, above, epilogue, y);
     }
 }
 
 /// Convolves by lines. An output pixel reads three pixels of a line: `3 * in` values side by side. Those of
 /// the next output pixel begin `in` values later. So a line is the left operand of a product as it is, and
 /// the convolution is a sum of three of them.
-#[allow(clippy::too_many_arguments, reason = "as `convolve`")]
-fn spread(
-    isa: Isa,
-    grid: Grid,
-    source: GatedMap,
-    above: usize,
-    weight: &[f32],
-    axes: Axes,
-    epilogue: BiasRelu,
-    y: &mut [f32],
-) {
-    let Axes {
-        inputs,
-        outputs: columns,
-        ..
-    } = axes;
+fn spread(isa: Isa, operands: ThinConvolution, above: usize, epilogue: BiasRelu, y: &mut [f32]) {
+    let ThinConvolution {
+        grid,
+        source,
+        weight,
+        axes,
+    } = operands;
+    let (inputs, columns) = (axes.inputs, axes.outputs);
     let weights: [Packed; 3] = std::array::from_fn(|line| {
         Packed::new(isa, 3 * inputs, columns, |k, column| {
             weight[axes.place(k % inputs, column, 3 * line + k / inputs)]

@@ -8,7 +8,7 @@ use super::line::{self, both, each};
 use super::tiles::{TransformedTiles, WinogradTiles, take_input};
 use super::weights::{padded, place_step};
 use crate::conv3x3::parts::{Axes, GatedMap};
-use crate::product::{Left, Right, padded_rows, product};
+use crate::product::{Left, Right, Size, Target, padded_rows, product};
 use crate::scratch::{Scratch, Shared};
 use crate::simd::{Leaf, Simd, WIDEST, run};
 use crate::{Grid, Isa};
@@ -104,16 +104,17 @@ impl Leaf for Accumulate {
                 start: self.b.pointer(),
                 step: self.b_step,
             };
-            product::<S>(
-                self.rows,
-                self.depth,
-                self.columns,
-                a,
-                b,
-                self.c.pointer(),
-                self.c_step,
-                true,
-            );
+            let size = Size {
+                rows: self.rows,
+                depth: self.depth,
+                columns: self.columns,
+            };
+            let c = Target {
+                start: self.c.pointer(),
+                step: self.c_step,
+                accumulate: true,
+            };
+            product::<S>(size, a, b, c);
         }
     }
 }

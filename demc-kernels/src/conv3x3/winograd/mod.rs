@@ -20,7 +20,7 @@ use rayon::prelude::*;
 
 use super::parts::{BiasRelu, GatedMap};
 use crate::Grid;
-use crate::product::{Left, Right, padded_rows, product};
+use crate::product::{Left, Right, Size, Target, padded_rows, product};
 use crate::scratch::{Scratch, Shared};
 use crate::simd::{Leaf, Simd, run};
 use line::{both, each};
@@ -83,8 +83,17 @@ impl<const IN: usize> Leaf for TileBlock<'_, IN> {
                     k_step: 1,
                 };
                 let b = Right::Packed(weights.values.as_ptr().add(place * weights.place_step));
-                let c = m.start.add(place * m.place_step);
-                product::<S>(count, depth, columns, a, b, c, wide, false);
+                let size = Size {
+                    rows: count,
+                    depth,
+                    columns,
+                };
+                let c = Target {
+                    start: m.start.add(place * m.place_step),
+                    step: wide,
+                    accumulate: false,
+                };
+                product::<S>(size, a, b, c);
             }
             for (index, tile) in range.enumerate() {
                 for channel in (0..columns).step_by(S::LANES) {

@@ -3,6 +3,8 @@
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use demc_kernels::batch_norm::{BatchNorm, Moments};
+use demc_kernels::blend::Scales;
+use demc_kernels::filter5x5::Filter;
 use demc_kernels::rel_mse::RelMse;
 use demc_kernels::{
     Convolution, Grid, Isa, batch_norm, blend, conv1x1, conv3x3, deconv4x4, filter5x5, grid, pool,
@@ -116,7 +118,11 @@ impl KernelOps for Flex {
         let [x, logits] = [x, logits].map(contiguous);
         let ((images, _), (grid, channels)) = (grid(&x), grid(&logits));
         let mut y = buffer(images.pixels() * (filter5x5::COLORS + channels - filter5x5::TAPS));
-        filter5x5::forward(Isa::current(), grid, values(&x), values(&logits), &mut y);
+        let filter = Filter {
+            x: values(&x),
+            logits: values(&logits),
+        };
+        filter5x5::forward(Isa::current(), grid, filter, &mut y);
         maps(images, y)
     }
 
@@ -124,7 +130,11 @@ impl KernelOps for Flex {
         let [filtered, coarse] = [filtered, coarse].map(contiguous);
         let (grid, _) = grid(&filtered);
         let mut out = buffer(grid.pixels() * filter5x5::COLORS);
-        blend::forward(grid, values(&filtered), values(&coarse), &mut out);
+        let scales = Scales {
+            filtered: values(&filtered),
+            coarse: values(&coarse),
+        };
+        blend::forward(grid, scales, &mut out);
         maps(grid, out)
     }
 

@@ -59,8 +59,11 @@ impl EventFile {
         fs::create_dir_all(dir).with_context(|| format!("cannot create {}", dir.display()))?;
         let name = next_name(dir).with_context(|| dir.display().to_string())?;
         let path = dir.join(name);
-        let file = OpenOptions::new().create_new(true).append(true).open(&path);
-        let file = file.with_context(|| path.display().to_string())?;
+        let file = OpenOptions::new()
+            .create_new(true)
+            .append(true)
+            .open(&path)
+            .with_context(|| path.display().to_string())?;
         let mut events = EventFile { file, path };
         events.write(0, EventContent::FileVersion(VERSION.to_string()))?;
         let status = SessionStatus::Start.into();

@@ -201,9 +201,9 @@ pub fn load(dir: &Path, config: &Config, device: &Device) -> anyhow::Result<Chec
         state.step
     );
     let plain = device.clone().without_autodiff();
-    let average = dir.join(AVERAGE);
-    let average = if average.exists() {
-        Some(Bundle::load(&average, &plain)?.model)
+    let average_file = dir.join(AVERAGE);
+    let average = if average_file.exists() {
+        Some(Bundle::load(&average_file, &plain)?.model)
     } else {
         None
     };

@@ -170,8 +170,9 @@ fn names_in(dir: &Path) -> anyhow::Result<Vec<String>> {
         return Ok(Vec::new());
     }
     let entries = fs::read_dir(dir).with_context(|| dir.display().to_string())?;
-    let names = entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()));
-    let names: std::io::Result<Vec<String>> = names.collect();
+    let names: std::io::Result<Vec<String>> = entries
+        .map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()))
+        .collect();
     names.with_context(|| dir.display().to_string())
 }
 

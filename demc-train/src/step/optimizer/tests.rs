@@ -115,8 +115,11 @@ fn weight_decay_shrinks_kernels_only() {
     let plain = Optimizer::new(&config).step(LR, model.clone(), grads());
     config.optimizer.weight_decay = 0.5;
     let decayed = Optimizer::new(&config).step(LR, model.clone(), grads());
-    let specs = model.config().weight_specs();
-    let specs = specs.into_iter().filter(|spec| spec.role.is_trainable());
+    let specs = model
+        .config()
+        .weight_specs()
+        .into_iter()
+        .filter(|spec| spec.role.is_trainable());
     let weights = [&model, &plain, &decayed].map(trainable);
     for (i, spec) in specs.enumerate() {
         let share = if spec.rows().is_some() { 0.5 * LR } else { 0.0 };

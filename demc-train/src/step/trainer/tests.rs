@@ -166,8 +166,9 @@ fn further_terms_add_to_the_loss_and_change_the_step() {
 
 #[test]
 fn every_patch_reports_its_loss() {
-    let step = trainer(&config(2, 2)).step(1e-3, || Ok::<_, Infallible>(batch(2, 0)));
-    let step = step.expect("no batch fails");
+    let step = trainer(&config(2, 2))
+        .step(1e-3, || Ok::<_, Infallible>(batch(2, 0)))
+        .expect("no batch fails");
     assert_eq!(step.patches.len(), 4);
     let mean = step.patches.iter().map(|(_, loss)| loss).sum::<f64>() / 4.0;
     assert_eq!(mean, step.loss);
@@ -250,8 +251,11 @@ fn dormant_channels_are_counted_once_they_can_be_known(reading: Reading, shift: 
         .step(1e-4, || Ok::<_, Infallible>(batch(2, 0)))
         .expect("no batch fails");
     let found = trainer.dormant().expect("late enough");
-    let biases = trainer.optimizer().specs().iter();
-    let biases = biases.filter(|spec| spec.name.ends_with(".bias"));
+    let biases = trainer
+        .optimizer()
+        .specs()
+        .iter()
+        .filter(|spec| spec.name.ends_with(".bias"));
     let channels: usize = biases.map(WeightSpec::len).sum();
     assert_eq!(found.channels, channels - 3, "all but the head's");
     // The latent has 16 channels; others that feed only it lose their gradient with it.

@@ -91,27 +91,28 @@ impl Comparison {
             );
         }
         let tables: Vec<[ScoreTable; 2]> = runs.iter().map(|runs| tables(runs)).collect();
-        let rows = spec.variants.iter().zip(runs).zip(&tables).enumerate();
-        let rows = rows.map(|(i, ((variant, runs), [relmse, ssim]))| {
-            let [first_relmse, first_ssim] = &tables[0];
-            let difference = |a: &ScoreTable, b: &ScoreTable| {
-                (i > 0).then(|| Estimate::of_difference(a, b)).flatten()
-            };
-            let model = variant.config.model;
-            VariantScores {
-                name: variant.name.clone(),
-                width: model.width,
-                parameters: model.parameter_count(),
-                flops_per_pixel: model.flops_per_pixel(),
-                seconds: mean(runs.iter().map(|run| run.seconds)),
-                relmse: Estimate::of(relmse).expect("there are images"),
-                ssim: Estimate::of(ssim),
-                relmse_difference: difference(relmse, first_relmse),
-                ssim_difference: difference(ssim, first_ssim),
-                relmse_of_seeds: relmse.iter().map(|row| mean(row.iter().copied())).collect(),
-                ssim_of_seeds: ssim.iter().map(|row| mean(row.iter().copied())).collect(),
-            }
-        });
+        let rows = spec.variants.iter().zip(runs).zip(&tables).enumerate().map(
+            |(i, ((variant, runs), [relmse, ssim]))| {
+                let [first_relmse, first_ssim] = &tables[0];
+                let difference = |a: &ScoreTable, b: &ScoreTable| {
+                    (i > 0).then(|| Estimate::of_difference(a, b)).flatten()
+                };
+                let model = variant.config.model;
+                VariantScores {
+                    name: variant.name.clone(),
+                    width: model.width,
+                    parameters: model.parameter_count(),
+                    flops_per_pixel: model.flops_per_pixel(),
+                    seconds: mean(runs.iter().map(|run| run.seconds)),
+                    relmse: Estimate::of(relmse).expect("there are images"),
+                    ssim: Estimate::of(ssim),
+                    relmse_difference: difference(relmse, first_relmse),
+                    ssim_difference: difference(ssim, first_ssim),
+                    relmse_of_seeds: relmse.iter().map(|row| mean(row.iter().copied())).collect(),
+                    ssim_of_seeds: ssim.iter().map(|row| mean(row.iter().copied())).collect(),
+                }
+            },
+        );
         Ok(Comparison {
             seeds: spec.seeds.clone(),
             images,
@@ -132,8 +133,7 @@ impl Comparison {
             let ssim = row
                 .ssim_difference
                 .map(|found| found.verdict("SSIM", Better::Higher));
-            let words = [relmse, ssim].into_iter().flatten();
-            let words: Vec<String> = words.collect();
+            let words: Vec<String> = [relmse, ssim].into_iter().flatten().collect();
             format!("{} against {}: {}", row.name, first.name, words.join("; "))
         };
         others.iter().map(verdict).collect()

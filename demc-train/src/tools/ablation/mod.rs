@@ -75,14 +75,18 @@ pub fn run(
 /// All runs, seed by seed.
 fn planned(spec: &AblationSpec) -> Vec<PlannedRun> {
     let total = spec.seeds.len() * spec.variants.len();
-    let runs = spec.seeds.iter().flat_map(|seed| {
-        let variants = spec.variants.iter();
-        variants.map(move |variant| (seed, variant))
-    });
-    let runs = runs.enumerate().map(|(index, (seed, variant))| PlannedRun {
-        name: format!("{}, seed {seed} ({} of {total})", variant.name, index + 1),
-        config: spec.run(variant, *seed),
-    });
+    let runs = spec
+        .seeds
+        .iter()
+        .flat_map(|seed| {
+            let variants = spec.variants.iter();
+            variants.map(move |variant| (seed, variant))
+        })
+        .enumerate()
+        .map(|(index, (seed, variant))| PlannedRun {
+            name: format!("{}, seed {seed} ({} of {total})", variant.name, index + 1),
+            config: spec.run(variant, *seed),
+        });
     runs.collect()
 }
 

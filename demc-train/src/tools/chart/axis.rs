@@ -108,9 +108,11 @@ fn log_points(range: &Range<f64>, is_light: bool, hint: impl KeyPointHint) -> Ve
     if all.len() <= most / 2 {
         return all;
     }
-    let some = [&[1, 2, 5][..], &[1, 2, 3, 5, 7]].map(|digits| points(digits, 1));
-    let some = some.into_iter().filter(|choice| choice.len() >= 3);
-    some.chain((1..=200).map(|stride| points(&[1], stride)))
+    [&[1, 2, 5][..], &[1, 2, 3, 5, 7]]
+        .map(|digits| points(digits, 1))
+        .into_iter()
+        .filter(|choice| choice.len() >= 3)
+        .chain((1..=200).map(|stride| points(&[1], stride)))
         .find(|choice| choice.len() <= most)
         .unwrap_or_default()
 }

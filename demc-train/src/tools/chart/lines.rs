@@ -28,8 +28,9 @@ pub(super) fn draw<B: DrawingBackend>(area: &Area<B>, panel: &LinePanel) -> Draw
     let points = || panel.series.iter().flat_map(|series| &series.points);
     let shown = || points().filter(|point| is_shown(point));
     let marks = panel.marks.iter().filter(|mark| shows(panel.x, mark.0));
-    let xs = shown().map(|point| point.0);
-    let xs = xs.chain(marks.clone().map(|mark| mark.0));
+    let xs = shown()
+        .map(|point| point.0)
+        .chain(marks.clone().map(|mark| mark.0));
     let x = Axis::over(panel.x, xs, [MARGINS[0]; 2]);
     let above = MARGINS[0] + MARGINS[1] * marks.clone().count() as f64;
     let ys = shown().map(|point| point.1);

@@ -109,8 +109,11 @@ fn lines_go_through_their_points() {
     assert_eq!([says(&svg, "step"), says(&svg, "loss")], [1, 1]);
     let root = svg.lines().next().unwrap();
     let size = ["width", "height"].map(|name| attribute(root, name).parse::<u32>().unwrap());
-    let view = attribute(root, "viewBox").split(' ').skip(2);
-    let view: Vec<u32> = view.map(|side| side.parse().unwrap()).collect();
+    let view: Vec<u32> = attribute(root, "viewBox")
+        .split(' ')
+        .skip(2)
+        .map(|side| side.parse().unwrap())
+        .collect();
     assert_eq!(size, [view[0] / 2, view[1] / 2]);
     assert!(size[0] >= 776 && size[1] == 450, "{size:?}");
     assert!(svg.contains("sans-serif"));

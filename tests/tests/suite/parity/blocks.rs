@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use burn::optim::GradientsParams;
-use burn::tensor::Tensor;
+use burn::tensor::{Device, Tensor};
 use demc_model::LossConfig;
 use demc_model::ops::{self, Activation, Maps};
 use demc_model::{Denoiser, Reading, Variant};
@@ -133,9 +133,71 @@ fn in_both_readings(path: &str, forward: BlockForward) {
 
 fn check(fixture: &Fixture, reading: Reading, path: &str, forward: BlockForward) -> String {
     let weights = Fixture::read(&network_name(&config(Variant::Demc, reading)));
-    let prefix = format!("{}/{path}", reading.spec().name);
-    let outputs_close = |mode: &str, outputs: &[Tensor<4>]| {
-        let expected = fixture.list(&format!("{prefix}/{mode}"), &super::device());
+    let block = Block {
+        fixture,
+        reading,
+        path,
+        prefix: format!("{}/{path}", reading.spec().name),
+    };
+    let network = |device: &Device| network(&config(Variant::Demc, reading), &weights, device);
+
+    let device = super::device();
+    let inputs = fixture.list(&format!("{}/input", block.prefix), &device);
+    let eval = block.outputs("eval", &run(&network(&device), forward, inputs));
+
+    let device = device.autodiff();
+    let model = network(&device);
+    let inputs: Vec<_> = fixture
+        .list(&format!("{}/input", block.prefix), &device)
+        .into_iter()
+        .map(Tensor::require_grad)
+        .collect();
+    let outputs = run(&model, forward, inputs.clone());
+    let train = block.outputs("train", &outputs);
+
+    let probes = fixture.list(&format!("{}/probe", block.prefix), &device);
+    let parts = outputs
+        .into_iter()
+        .zip(probes)
+        .map(|(output, probe)| (output * probe).sum());
+    let mut gradients = parts
+        .reduce(|a, b| a + b)
+        .expect("a block has an output")
+        .backward();
+    let input_grads: Vec<_> = inputs
+        .iter()
+        .map(|input| {
+            let gradient = input.grad(&gradients);
+            host(gradient.expect("the outputs depend on each input"))
+        })
+        .collect();
+    let weight_grads = gradients_by_name(
+        &model,
+        &GradientsParams::from_module(&mut gradients, &model),
+    );
+    let worst = block
+        .input_gradients(&input_grads)
+        .max(block.weight_gradients(&weight_grads));
+    block.running_statistics(&model);
+    format!("eval {eval:.3}, train {train:.3}, gradients {worst:.3}")
+}
+
+/// A block of a network, and what PyTorch computes for it.
+struct Block<'a> {
+    fixture: &'a Fixture,
+    reading: Reading,
+    path: &'a str,
+    /// Of its names in the fixture.
+    prefix: String,
+}
+
+/// Each comparison returns the largest share of its tolerance.
+impl Block<'_> {
+    fn outputs(&self, mode: &str, outputs: &[Tensor<4>]) -> f32 {
+        let prefix = &self.prefix;
+        let expected = self
+            .fixture
+            .list(&format!("{prefix}/{mode}"), &super::device());
         assert_eq!(outputs.len(), expected.len(), "{prefix}: number of outputs");
         let pairs = outputs.iter().zip(expected).map(|(found, expected)| {
             assert_eq!(found.dims(), expected.dims(), "{prefix}");
@@ -147,93 +209,58 @@ fn check(fixture: &Fixture, reading: Reading, path: &str, forward: BlockForward)
             )
         });
         pairs.fold(0.0, f32::max)
-    };
+    }
 
-    let device = super::device();
-    let model = network(&config(Variant::Demc, reading), &weights, &device);
-    let eval = outputs_close(
-        "eval",
-        &run(
-            &model,
-            forward,
-            fixture.list(&format!("{prefix}/input"), &device),
-        ),
-    );
+    fn input_gradients(&self, found: &[Vec<f32>]) -> f32 {
+        let shares = found.iter().enumerate().map(|(i, found)| {
+            let name = format!("{}/input_grad.{i}", self.prefix);
+            assert_close(&name, found, self.fixture.values(&name), GRADIENT)
+        });
+        shares.fold(0.0, f32::max)
+    }
 
-    let device = device.autodiff();
-    let model = network(&config(Variant::Demc, reading), &weights, &device);
-    let inputs: Vec<_> = fixture
-        .list(&format!("{prefix}/input"), &device)
-        .into_iter()
-        .map(Tensor::require_grad)
-        .collect();
-    let outputs = run(&model, forward, inputs.clone());
-    let train = outputs_close("train", &outputs);
-
-    let probes = fixture.list(&format!("{prefix}/probe"), &device);
-    let parts = outputs
-        .into_iter()
-        .zip(probes)
-        .map(|(output, probe)| (output * probe).sum());
-    let mut gradients = parts
-        .reduce(|a, b| a + b)
-        .expect("a block has an output")
-        .backward();
-    let mut worst = 0.0f32;
-    for (i, input) in inputs.iter().enumerate() {
-        let name = format!("{prefix}/input_grad.{i}");
-        let found = host(
-            input
-                .grad(&gradients)
-                .expect("the outputs depend on each input"),
+    fn weight_gradients(&self, found: &BTreeMap<String, Vec<f32>>) -> f32 {
+        let prefix = &self.prefix;
+        let expected: BTreeMap<_, _> = self
+            .fixture
+            .group(&format!("{prefix}/grad."))
+            .into_iter()
+            .map(|w| (format!("{}.{}", self.path, w.name), w.data))
+            .collect();
+        assert!(
+            found.keys().eq(expected.keys()),
+            "{prefix}: every parameter has a gradient, and nothing else"
         );
-        worst = worst.max(assert_close(&name, &found, fixture.values(&name), GRADIENT));
+        let shares = expected.iter().map(|(name, expected)| {
+            let tolerance = if is_bias_before_norm(name, self.reading) {
+                // Zero by construction: gradients of the other parameters are of order 1 to 1000.
+                Tolerance {
+                    absolute: 1e-3,
+                    ..GRADIENT
+                }
+            } else {
+                GRADIENT
+            };
+            let what = format!("{prefix} gradient of {name}");
+            assert_close(&what, &found[name], expected, tolerance)
+        });
+        shares.fold(0.0, f32::max)
     }
 
-    let found = gradients_by_name(
-        &model,
-        &GradientsParams::from_module(&mut gradients, &model),
-    );
-    let expected: BTreeMap<_, _> = fixture
-        .group(&format!("{prefix}/grad."))
-        .into_iter()
-        .map(|w| (format!("{path}.{}", w.name), w.data))
-        .collect();
-    assert!(
-        found.keys().eq(expected.keys()),
-        "{prefix}: every parameter has a gradient, and nothing else"
-    );
-    for (name, expected) in &expected {
-        let tolerance = if is_bias_before_norm(name, reading) {
-            // Zero by construction: gradients of the other parameters are of order 1 to 1000.
-            Tolerance {
-                absolute: 1e-3,
-                ..GRADIENT
-            }
-        } else {
-            GRADIENT
-        };
-        worst = worst.max(assert_close(
-            &format!("{prefix} gradient of {name}"),
-            &found[name],
-            expected,
-            tolerance,
-        ));
+    fn running_statistics(&self, model: &Denoiser) {
+        let after: BTreeMap<_, _> = model
+            .weights()
+            .into_iter()
+            .map(|w| (w.name, w.data))
+            .collect();
+        for running in self.fixture.group(&format!("{}/after.", self.prefix)) {
+            let name = format!("{}.{}", self.path, running.name);
+            assert_close(
+                &format!("{name} after one pass"),
+                &after[&name],
+                &running.data,
+                OUTPUT,
+            );
+        }
     }
-
-    let after: BTreeMap<_, _> = model
-        .weights()
-        .into_iter()
-        .map(|w| (w.name, w.data))
-        .collect();
-    for running in fixture.group(&format!("{prefix}/after.")) {
-        let name = format!("{path}.{}", running.name);
-        assert_close(
-            &format!("{name} after one pass"),
-            &after[&name],
-            &running.data,
-            OUTPUT,
-        );
-    }
-    format!("eval {eval:.3}, train {train:.3}, gradients {worst:.3}")
 }

@@ -14,6 +14,8 @@ use burn::backend::flex::FlexTensor;
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, AutodiffBackend, Flex};
 use demc_kernels::batch_norm::{BatchNormSource, Moments};
+use demc_kernels::blend::Scales;
+use demc_kernels::filter5x5::Filter;
 use demc_kernels::{Isa, batch_norm, blend, filter5x5, pool};
 
 use super::forward::{fuse, rel_mse_into};
@@ -220,8 +222,11 @@ impl Backward<Flex, 1> for Filter5x5 {
         if let Some(node) = node {
             let (grid, _) = grid(&x);
             let mut dlogits = buffer(values(&logits).len());
-            let (image, logits, dy) = (values(&x), values(&logits), values(&dy));
-            filter5x5::backward(Isa::current(), grid, image, logits, dy, &mut dlogits);
+            let filter = Filter {
+                x: values(&x),
+                logits: values(&logits),
+            };
+            filter5x5::backward(Isa::current(), grid, filter, values(&dy), &mut dlogits);
             grads.register::<Flex>(node.id, maps(grid, dlogits));
         }
     }
@@ -240,7 +245,8 @@ impl Backward<Flex, 2> for Blend {
         let (grid, _) = grid(&ops.state[0]);
         let mut gradients = [buffer(filtered.len()), buffer(coarse.len())];
         let [dfiltered, dcoarse] = &mut gradients;
-        blend::backward(grid, filtered, coarse, values(&dout), dfiltered, dcoarse);
+        let scales = Scales { filtered, coarse };
+        blend::backward(grid, scales, values(&dout), dfiltered, dcoarse);
         let grids = [grid, grid.halved()];
         for ((node, gradient), grid) in ops.parents.into_iter().zip(gradients).zip(grids) {
             if let Some(node) = node {
