@@ -9,8 +9,7 @@ mod thin;
 mod winograd;
 
 use crate::{Convolution, GradientSource, GradientTarget, Grid, Isa};
-use parts::{Axes, BiasRelu, GatedMap};
-use thin::ThinConvolution;
+use parts::{Axes, BiasRelu, GatedMap, ThinConvolution};
 
 /// Tiles of the Winograd transforms.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

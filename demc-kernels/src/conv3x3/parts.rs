@@ -1,5 +1,6 @@
 //! Shared by all 3x3 convolution kernels: the layout of the weight, the input map, bias and ReLU.
 
+use crate::Grid;
 use crate::simd::Simd;
 
 /// How the axes of a weight `[out, in, 3, 3]` are read.
@@ -76,4 +77,14 @@ impl BiasRelu<'_> {
             }
         }
     }
+}
+
+/// What a convolution reads, beside its epilogue.
+#[derive(Clone, Copy)]
+pub(crate) struct ThinConvolution<'a> {
+    /// Grid of `source`.
+    pub(crate) grid: Grid,
+    pub(crate) source: GatedMap<'a>,
+    pub(crate) weight: &'a [f32],
+    pub(crate) axes: Axes,
 }

@@ -61,7 +61,12 @@ fn resume(bytes: &[u8], lines: &[(&[u8], Step)], damaged: &[usize], step: u64) {
     fs::write(&*LOG, bytes).expect("writable");
     let mut log = MetricsLog::open(&LOG, step).expect("any bytes are a log");
     assert_eq!(log.damaged(), damaged);
-    let kept: Vec<u8> = lines.iter().filter(|(_, line)| line.step <= step).flat_map(|(text, _)| *text).copied().collect();
+    let kept: Vec<u8> = lines
+        .iter()
+        .filter(|(_, line)| line.step <= step)
+        .flat_map(|(text, _)| *text)
+        .copied()
+        .collect();
     assert_eq!(fs::read(&*LOG).expect("readable"), kept);
     log.append(&line(step)).expect("writable");
     let stored = fs::read(&*LOG).expect("readable");

@@ -111,7 +111,8 @@ fn section(source: &Path) -> Result<String, cbindgen::Error> {
     let blocks: Vec<&str> = text
         .trim()
         .split("\n\n")
-        .filter(|block| !block.ends_with("Object;")).collect();
+        .filter(|block| !block.ends_with("Object;"))
+        .collect();
     // Marks of Rust's documentation.
     Ok(blocks
         .join("\n\n")

@@ -2,9 +2,8 @@
 
 use rayon::prelude::*;
 
-use super::ThinConvolution;
 use super::gather::neighbour;
-use crate::conv3x3::parts::BiasRelu;
+use crate::conv3x3::parts::{BiasRelu, ThinConvolution};
 use crate::product::padded_rows;
 use crate::rows::{self, BLOCK, Packed, Term, whole};
 use crate::scratch::Scratch;

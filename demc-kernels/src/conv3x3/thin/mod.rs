@@ -15,7 +15,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::parts::{Axes, BiasRelu, GatedMap};
+use super::parts::{BiasRelu, GatedMap, ThinConvolution};
 use crate::product::padded_rows;
 use crate::rows::{self, BLOCK, Outer, Packed, Term, whole};
 use crate::scratch::Scratch;
@@ -24,16 +24,6 @@ use collect::collect;
 
 /// Maximum number of output values over all taps for which collecting pays off.
 const MOST_COLLECTED: usize = 36;
-
-/// What a convolution reads, beside its epilogue.
-#[derive(Clone, Copy)]
-pub(crate) struct ThinConvolution<'a> {
-    /// Grid of `source`.
-    pub(crate) grid: Grid,
-    pub(crate) source: GatedMap<'a>,
-    pub(crate) weight: &'a [f32],
-    pub(crate) axes: Axes,
-}
 
 /// `y = epilogue(weight * source)` for the rows from `above` on, as many as `y` has.
 ///
