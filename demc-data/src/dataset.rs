@@ -15,8 +15,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::Error;
 use crate::image::channel::Window;
+use crate::image::exr::ExrFile;
 use crate::image::frame::{Presence, check_header};
-use crate::image::layout::ChannelLayout;
+use crate::image::layout::{ChannelLayout, MissingPolicies, detect};
 use crate::seed::{RandomStream, generator};
 
 /// The manifest format that this version reads and writes.
@@ -229,6 +230,16 @@ fn parse(root: &Path, text: &str) -> Result<Vec<Scene>, String> {
         other: entry.other,
     };
     Ok(scenes.into_iter().map(scene).collect())
+}
+
+/// The preset that fits the first readable file of a data set, or `demc-exr` if none fits.
+pub fn preset_of(scenes: &[Scene]) -> &'static str {
+    let fitting = |scene: &Scene| {
+        let file = ExrFile::open(&scene.path).ok()?;
+        let found = detect(&file, MissingPolicies::default(), None).ok()?;
+        Some(found.preset)
+    };
+    scenes.iter().find_map(fitting).unwrap_or("demc-exr")
 }
 
 fn manifest_problems(scenes: &[Scene]) -> Vec<String> {

@@ -66,6 +66,21 @@ pub enum Error {
         /// Number of bad samples in this channel.
         count: usize,
     },
+    /// A buffer with too many NaN or infinite samples to be repaired.
+    #[error(
+        "{}: channel {channel}: {count} of {samples} samples are NaN or infinite, more than the {percent} % that are repaired",
+        path.display()
+    )]
+    Unrepairable {
+        path: PathBuf,
+        channel: String,
+        /// Number of bad samples.
+        count: usize,
+        /// Number of all samples.
+        samples: usize,
+        /// The largest share that is repaired.
+        percent: u32,
+    },
     /// An unusable channel layout.
     #[error("channel layout {name}: {detail}")]
     Layout { name: String, detail: String },

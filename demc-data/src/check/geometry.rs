@@ -25,9 +25,17 @@ const LOWEST: f32 = -0.05;
 /// Smallest median cosine between the normals and the surface that the positions describe
 /// (classroom: 0.977).
 const ALIGNED: f32 = 0.8;
-/// Share of normals that face the origin above which the origin must be the camera (staircase:
+/// Share of normals that face the origin above which the origin may be the camera (staircase:
 /// 0.995).
 const FACING: f32 = 0.9995;
+/// Smallest distance of a position from the line through the ends of its row or column, in lengths of that line,
+/// at which it tells where the camera is.
+const OFF_LINE: f32 = 0.02;
+/// Largest distance of the origin from the plane through a position and those ends, in lengths of the
+/// position. All rays of a row lie in one plane through the camera.
+const IN_PLANE: f32 = 0.03;
+/// Share of positions with the origin in that plane above which it is the camera.
+const PLANAR: f32 = 0.9;
 
 /// First plane of each buffer.
 const NORMAL: usize = 0;
@@ -78,10 +86,6 @@ struct SurfacePixels<'a> {
 impl<'a> SurfacePixels<'a> {
     fn of(frame: &'a Frame) -> Self {
         let Frame { width, height, .. } = *frame;
-        let hit = |i: usize| match &frame.mask {
-            Some(mask) => mask[i] >= 1.0,
-            None => vector(frame, POSITIONS, i) != [0.0; 3],
-        };
         let inner = |length: usize| 1..length.saturating_sub(1);
         let count = inner(width).len() * inner(height).len();
         let pixels = inner(height)
@@ -90,7 +94,7 @@ impl<'a> SurfacePixels<'a> {
             .filter(|i| {
                 [*i, i - 1, i + 1, i - width, i + width]
                     .into_iter()
-                    .all(hit)
+                    .all(|i| hits(frame, i))
             })
             .collect();
         Self { frame, pixels }
@@ -137,13 +141,42 @@ impl<'a> SurfacePixels<'a> {
                 vector(self.frame, POSITIONS, i),
             ) < 0.0
         });
-        if facing > FACING {
+        if facing > FACING && self.origin_is_camera() {
             return warning(
                 "all normals face the origin".into(),
                 "are normals and positions in camera space? The network was trained on world space",
             );
         }
         None
+    }
+
+    /// Whether the positions of each row and column lie in a plane through the origin, as rays from it do. The
+    /// answer is no if each row and column lies on a line, as on a wall, which tells nothing.
+    fn origin_is_camera(&self) -> bool {
+        let Frame { width, height, .. } = *self.frame;
+        let ends = |mut line: Box<dyn DoubleEndedIterator<Item = usize>>| {
+            let hit = |i: &usize| hits(self.frame, *i);
+            let first = line.find(hit)?;
+            Some([first, line.rfind(hit)?])
+        };
+        let row = |y: usize| ends(Box::new(y * width..(y + 1) * width));
+        let column = |x: usize| ends(Box::new((x..height * width).step_by(width)));
+        let rows: Vec<_> = (0..height).map(row).collect();
+        let columns: Vec<_> = (0..width).map(column).collect();
+        let (mut told, mut planar) = (0, 0);
+        for &i in &self.pixels {
+            for ends in [rows[i / width], columns[i % width]].into_iter().flatten() {
+                let [a, b, x] = [ends[0], ends[1], i].map(|i| vector(self.frame, POSITIONS, i));
+                let line = difference(b, a);
+                let plane = cross(line, difference(x, a));
+                let area = norm(plane);
+                if area > OFF_LINE * dot(line, line) {
+                    told += 1;
+                    planar += usize::from(dot(plane, x).abs() < IN_PLANE * area * norm(x));
+                }
+            }
+        }
+        told >= MIN_SAMPLES && planar as f32 > PLANAR * told as f32
     }
 
     fn texture(&self) -> Option<Warning> {
@@ -186,6 +219,14 @@ impl<'a> SurfacePixels<'a> {
     fn minimum(&self, first: usize) -> f32 {
         let vectors = self.pixels.iter().map(|i| vector(self.frame, first, *i));
         vectors.flatten().fold(f32::INFINITY, f32::min)
+    }
+}
+
+/// Whether all rays of a pixel hit a surface.
+fn hits(frame: &Frame, i: usize) -> bool {
+    match &frame.mask {
+        Some(mask) => mask[i] >= 1.0,
+        None => vector(frame, POSITIONS, i) != [0.0; 3],
     }
 }
 
@@ -300,6 +341,17 @@ mod tests {
         assert!(one(&camera).contains("normals and positions in camera space"));
         let shifted = mapped(room(CAMERA), TEXTURE1, |t| t.map(|x| x - 1.0));
         assert!(one(&shifted).starts_with("texture1: its minimum is -0.50"));
+    }
+
+    /// A scene around the origin in world space: all its normals face the origin, where no camera is.
+    #[test]
+    fn normals_that_face_the_origin_of_the_world_cause_no_warning() {
+        let centred = mapped(room(CAMERA), POSITIONS, |p| {
+            difference(p, [1.0, 40.0, 20.0])
+        });
+        assert_eq!(found(&centred), [""; 0]);
+        let wall = mapped(room([1.0, 50.0, 4.0]), POSITIONS, |p| difference(p, CAMERA));
+        assert_eq!(found(&wall), [""; 0], "a wall alone tells nothing");
     }
 
     #[test]

@@ -9,6 +9,7 @@ use demc_program::exit;
 use demc_program::message::{self, printable};
 
 use crate::check::doctor::{Affected, Problem, Report, examine};
+use crate::training::config::{MAX_PATCH_SIZE, PATCH_MULTIPLE, PATCH_SIZE};
 
 #[derive(Args)]
 #[command(after_help = "Example:\n  demc-data doctor data/sample")]
@@ -19,8 +20,8 @@ pub struct Arguments {
     /// Channel layout: a preset or a TOML file; by default the preset that fits the first file
     #[arg(long, value_name = "PRESET|FILE")]
     layout: Option<String>,
-    /// Patch size of training in pixels
-    #[arg(long, default_value_t = 128, value_name = "PIXELS")]
+    /// Patch size of training in pixels: a multiple of 32, at most 4096
+    #[arg(long, default_value_t = PATCH_SIZE, value_name = "PIXELS", value_parser = patch_size)]
     patch_size: usize,
     /// Print one JSON object instead of lines
     #[arg(long)]
@@ -29,6 +30,16 @@ pub struct Arguments {
 
 /// Scenes that are named for a problem; the others are counted.
 const NAMED: usize = 4;
+
+/// Parses the patch size of training.
+fn patch_size(text: &str) -> Result<usize, String> {
+    let allowed = |size: &usize| {
+        (PATCH_MULTIPLE..=MAX_PATCH_SIZE).contains(size) && size.is_multiple_of(PATCH_MULTIPLE)
+    };
+    text.parse().ok().filter(allowed).ok_or_else(|| {
+        format!("expected a multiple of {PATCH_MULTIPLE} from {PATCH_MULTIPLE} to {MAX_PATCH_SIZE}")
+    })
+}
 
 impl Arguments {
     /// Prints one line per problem and a summary, or one JSON object.

@@ -11,7 +11,7 @@ use demc_program::message::{self, printable};
 use serde::Serialize;
 
 use super::number::number;
-use crate::dataset::{Dataset, Scene, Split};
+use crate::dataset::{Dataset, Scene, Split, preset_of};
 use crate::image::frame::FEATURE_NAMES;
 use crate::image::layout::ChannelLayout;
 use crate::training::config::DataConfig;
@@ -29,9 +29,10 @@ pub struct Arguments {
     /// Directory of the data set, with its manifest.json
     #[arg(value_name = "DIR")]
     root: PathBuf,
-    /// Channel layout: demc-exr, mitsuba3, pbrt-v4, cycles, luxcore, fbksd, or a TOML file
-    #[arg(long, default_value = "demc-exr")]
-    layout: String,
+    /// Channel layout: demc-exr, mitsuba3, pbrt-v4, cycles, luxcore, fbksd, or a TOML file [default: the preset
+    /// that fits the first file]
+    #[arg(long, value_name = "PRESET|FILE")]
+    layout: Option<String>,
     /// The split to measure
     #[arg(long, default_value = "train", value_parser = parse_split, value_name = "train|test")]
     split: Split,
@@ -79,11 +80,15 @@ impl Arguments {
     pub fn run(&self) -> Result<u8> {
         let Self {
             root,
-            layout: layout_name,
+            layout,
             split,
             json,
         } = self;
         let split = *split;
+        let layout_name = match layout {
+            Some(name) => name.as_str(),
+            None => preset_of(&Dataset::list(root)?),
+        };
         let layout = ChannelLayout::resolve(layout_name)?;
         let dataset = Dataset::open(root, &layout)?;
         let config = DataConfig::default();

@@ -7,7 +7,6 @@ pub mod channel;
 pub mod exr;
 pub mod frame;
 pub mod layout;
-pub(crate) mod moments;
 pub mod plane;
 pub mod rewrite;
 pub mod rgb;

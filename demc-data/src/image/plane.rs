@@ -6,8 +6,6 @@ use std::ops::Range;
 use half::f16;
 use half::slice::HalfFloatSliceExt;
 
-use crate::image::moments::median;
-
 /// Largest distance of a neighbour that repairs a sample, in pixels.
 const MAX_RADIUS: usize = 8;
 
@@ -226,6 +224,17 @@ fn clamp<T: PartialOrd + Copy>(samples: &mut [T], zero: T) -> usize {
 fn all_equal<T: Copy + PartialEq>(samples: &[T]) -> Option<T> {
     let first = *samples.first()?;
     samples.iter().all(|x| *x == first).then_some(first)
+}
+
+/// The upper median; `None` of nothing.
+pub(crate) fn median(values: impl Iterator<Item = f32>) -> Option<f32> {
+    let mut values: Vec<f32> = values.collect();
+    let middle = values.len() / 2;
+    if values.is_empty() {
+        None
+    } else {
+        Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
+    }
 }
 
 #[cfg(test)]

@@ -17,7 +17,7 @@ use super::exr::recode::recode;
 use crate::error::Error;
 use crate::image::layout::ChannelLayout;
 
-pub use super::exr::plan::{Change, OutputChannels, WriteOptions};
+pub use super::exr::plan::{Change, OutputChannels, RECORD, WriteOptions};
 
 /// The result of writing an image.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]

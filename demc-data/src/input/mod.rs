@@ -3,6 +3,7 @@
 //! [`ranges`] measures an image, [`position`] and [`preparation`] convert a whole image,
 //! [`transform`] converts any part of it.
 
+pub(crate) mod moments;
 pub mod position;
 pub mod preparation;
 pub mod ranges;

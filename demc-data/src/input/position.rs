@@ -4,8 +4,8 @@
 use serde::{Deserialize, Serialize};
 
 use crate::image::frame::{FEATURES, POSITIONS, TEXTURES};
-use crate::image::moments::median;
-use crate::image::plane::Plane;
+
+use crate::image::plane::{Plane, median};
 
 /// Largest absolute value after the mapping, in extents: farther surfaces are at this distance.
 const FARTHEST: f32 = 5.0;

@@ -4,12 +4,8 @@
 
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::image::frame::{FEATURES, TEXTURES};
+use crate::image::frame::{FEATURES, MAX_ALBEDO, TEXTURES};
 use crate::input::position::{PositionMap, PositionSpace};
-
-/// Largest albedo: larger values count as this. Where a lamp is seen in metal, a renderer may write
-/// 90, which demodulation would turn into a spike.
-pub const MAX_ALBEDO: f32 = 1.0;
 
 /// Minimum standard deviation of a feature channel, in the channel's own unit (ours: the paper is
 /// silent). It makes a constant channel zero instead of 0/0. 1e-3 is half precision's spacing at 1,

@@ -14,7 +14,7 @@ const ROOT: &str = "data/sample";
 /// The layout of this project's own files.
 const LAYOUT: &str = "demc-exr";
 /// "We set patch size as 128 x 128" (Sec. 4.2).
-const PATCH_SIZE: usize = 128;
+pub(crate) const PATCH_SIZE: usize = 128;
 /// "... and stride as 80" (Sec. 4.2).
 const STRIDE: usize = 80;
 /// Eq. 4.
@@ -36,9 +36,9 @@ const EXPOSURE_LEVELS: std::ops::RangeInclusive<f32> = 1e-3..=10.0;
 /// Below 1, `y^gamma` and the loss have an infinite slope at black; a value above 6 is a mistake.
 const GAMMAS: std::ops::RangeInclusive<f32> = 1.0..=6.0;
 /// The network halves its input five times, so patch sizes are multiples of this (Fig. 3).
-const PATCH_MULTIPLE: usize = 32;
+pub(crate) const PATCH_MULTIPLE: usize = 32;
 /// A longer side is a mistake: the paper's scenes are 1280x720.
-const MAX_PATCH_SIZE: usize = 4096;
+pub(crate) const MAX_PATCH_SIZE: usize = 4096;
 /// More patches than this are a mistake: at the paper's patch size their features are 52 GB.
 const MAX_BATCH_SIZE: usize = 65536;
 /// 16 TiB. A larger value is a mistake and could overflow a `usize` in bytes.

@@ -7,10 +7,10 @@ use demc_program::parallel;
 use crate::check::content::{ContentProblem, suspicious};
 use crate::dataset::{Scene, size_mismatch};
 use crate::error::Error;
-use crate::image::frame::{FEATURES, FramePlanes, Presence, TEXTURES};
+use crate::image::frame::{FEATURES, FramePlanes, MAX_ALBEDO, Presence, TEXTURES};
 use crate::image::layout::ChannelLayout;
-use crate::image::moments::{ChannelMoments, hit_samples};
 use crate::image::plane::Plane;
+use crate::input::moments::{ChannelMoments, counted_samples};
 use crate::input::ranges::{FrameSummary, Ranges};
 use crate::input::transform::{FeatureStats, Normalizer, STD_FLOOR};
 use crate::training::config::DataConfig;
@@ -148,7 +148,7 @@ impl SceneSums {
             ..Self::default()
         };
         for (channel, plane) in planes.features.iter().enumerate() {
-            let samples = hit_samples(channel, plane.to_f32(), mask.as_deref());
+            let samples = counted_samples(channel, plane.to_f32(), mask.as_deref());
             sums.features[channel] = ChannelMoments::of(&samples);
         }
         let color: Vec<f32> = planes.color.iter().flat_map(Plane::to_f32).collect();
@@ -160,7 +160,7 @@ impl SceneSums {
                 Some(epsilon) => texture
                     .to_f32()
                     .iter()
-                    .map(|t| t.max(0.0) + epsilon)
+                    .map(|t| t.clamp(0.0, MAX_ALBEDO) + epsilon)
                     .collect(),
                 None => vec![1.0; pixels],
             };

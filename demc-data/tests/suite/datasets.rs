@@ -321,7 +321,7 @@ fn statistics_normalise_the_scenes_they_were_measured_on() {
 fn misses_count_for_textures_and_not_for_geometry_and_constants_keep_a_floor() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let set = dataset(dir.path(), vec![entry("a", "train", "a")]).expect("sound");
-    // 48 pixels; the upper half are misses. normal.X is 0 there and 2 at hits, like albedo1.R.
+    // 48 pixels; the upper half are misses. normal.X is 0 there and 2 at hits, like albedo1.R, where 2 counts as 1.
     let upper =
         |missed: f32, hit: f32| half((0..48).map(move |i| if i < 24 { missed } else { hit }));
     let mut channels = scene_channels(8, 6);
@@ -339,7 +339,7 @@ fn misses_count_for_textures_and_not_for_geometry_and_constants_keep_a_floor() {
     assert_eq!((stats.pixels, stats.misses, stats.clamped), (48, 24, 24));
     let features = stats.normalizer.features;
     assert_eq!((features.mean[0], features.std[0]), (2.0, STD_FLOOR));
-    assert_eq!((features.mean[6], features.std[6]), (1.0, 1.0));
+    assert_eq!((features.mean[6], features.std[6]), (0.5, 0.5));
     // Half black, half 1: weights of 1 / 0.001 and 1 / 1.001 (Eq. 5).
     let best = (1.0f64 / 1.001) / (1.0 / 0.001 + 1.0 / 1.001);
     let expected = best.powf(1.0 / 2.2) as f32;

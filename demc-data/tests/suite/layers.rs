@@ -147,8 +147,8 @@ fn channels_that_are_no_layers_are_named_with_the_reason() {
 fn bad_samples_of_a_layer_are_refused_or_repaired_and_negative_ones_kept() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let input = dir.path().join("in.exr");
-    let lamp = vec![-1.0, f32::NAN, -3.0, -3.0];
-    let flat = |x: f32| half(vec![x; 4]);
+    let lamp: Vec<f32> = [vec![-1.0, f32::NAN], vec![-3.0; 14]].concat();
+    let flat = |x: f32| half(vec![x; 16]);
     let channels = named([
         ("R", flat(0.5)),
         ("G", flat(0.5)),
@@ -156,7 +156,7 @@ fn bad_samples_of_a_layer_are_refused_or_repaired_and_negative_ones_kept() {
         ("lamp.R", FlatSamples::F32(lamp)),
         ("sun.R", flat(-0.25)),
     ]);
-    write(&input, (2, 2), channels);
+    write(&input, (4, 4), channels);
     let decode = |repair: bool| {
         let mut file = ExrFile::open(&input).expect("a file");
         decode_layers(&mut file, &layout(), &names(&["sun.R", "lamp.R"]), repair)
@@ -173,5 +173,6 @@ fn bad_samples_of_a_layer_are_refused_or_repaired_and_negative_ones_kept() {
     }
     let (layers, repaired) = decode(true).expect("repaired");
     assert_eq!(repaired, 1);
-    assert_eq!(layers, [vec![-0.25; 4], vec![-1.0, -3.0, -3.0, -3.0]]);
+    let mended = [vec![-1.0], vec![-3.0; 15]].concat();
+    assert_eq!(layers, [vec![-0.25; 16], mended]);
 }

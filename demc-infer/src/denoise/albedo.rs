@@ -7,8 +7,8 @@
 use std::sync::Arc;
 
 use demc_data::Frame;
+use demc_data::image::frame::MAX_ALBEDO;
 use demc_data::image::frame::TEXTURES;
-use demc_data::input::transform::MAX_ALBEDO;
 use demc_model::config::COLOR_CHANNELS;
 use rayon::prelude::*;
 

@@ -13,7 +13,9 @@ mod drift;
 mod energy;
 
 use demc_data::check::geometry;
-use demc_data::image::frame::{FEATURE_NAMES, POSITIONS, TEXTURES};
+use demc_data::image::frame::{FEATURE_NAMES, MAX_ALBEDO, POSITIONS, TEXTURES};
+use demc_data::input::ranges::exposure;
+use demc_data::input::transform::MAX_INPUT_SCALE;
 use demc_data::{Frame, FrameSummary};
 
 use crate::Bundle;
@@ -30,10 +32,6 @@ pub use energy::EnergyBias;
 /// classroom is at 1000, and 100 of the 108 scenes exceed this limit. The other 8 are generated,
 /// small and near the training mean.
 pub const FARTHEST_RMS: f64 = 100.0;
-
-/// Number of channels whose missed pixels are left out, as in the statistics: normal xyz and
-/// position xyz.
-const GEOMETRY: usize = 6;
 
 impl Bundle {
     /// Lists how `frame` differs from the training data. The list is empty for an image like the
@@ -53,13 +51,29 @@ impl Bundle {
             let named = |warning: &Warning| known.iter().any(|what| warning.what.contains(what));
             warnings.extend(drift.into_iter().filter(|warning| !named(warning)));
         }
+        warnings.extend(self.beyond_scale(exposure(&frame.color)));
         Ok(warnings)
+    }
+
+    /// A warning about an exposure that the largest or smallest factor does not bring to that of training.
+    fn beyond_scale(&self, exposure: f64) -> Option<Warning> {
+        let inside = 1.0 / MAX_INPUT_SCALE..MAX_INPUT_SCALE;
+        let scale = self.input_scale(exposure);
+        let beyond = exposure > 0.0 && !(scale > inside.start && scale < inside.end);
+        beyond.then(|| Warning {
+            what: "exposure".into(),
+            found: format!(
+                "it is {exposure:.1e}, and the factor on the colour is limited to {scale:.0e}"
+            ),
+            cause: "is radiance in another unit?",
+        })
     }
 
     /// Refuses a frame with a feature channel far from the training scenes: the root mean square of
     /// `(x - mean) / deviation` is [`FARTHEST_RMS`] or more.
     ///
-    /// Normals and positions count only where the mask reports a hit, as in the statistics.
+    /// Normals and positions count only where the mask reports a hit, and albedo up to 1, as in the
+    /// statistics.
     /// [`denoise`](Self::denoise) starts with this check.
     ///
     /// # Errors
@@ -72,9 +86,10 @@ impl Bundle {
         // Mapped positions cannot be far.
         let mapped = !self.meta.normalizer.position.is_scene();
         for (i, plane) in planes.filter(|(i, _)| !(mapped && (POSITIONS..TEXTURES).contains(i))) {
-            let mask = frame.mask.as_deref().filter(|_| i < GEOMETRY);
+            let mask = frame.mask.as_deref().filter(|_| i < TEXTURES);
+            let largest = if i < TEXTURES { f32::MAX } else { MAX_ALBEDO };
             let (mean, std) = (stats.mean[i], stats.std[i]);
-            let rms = rms_z(plane, mask, f64::from(mean), f64::from(std));
+            let rms = rms_z(plane, mask, largest, [mean, std].map(f64::from));
             // Only a frame made in memory can hold NaN: reading a file refuses it.
             if rms >= FARTHEST_RMS || rms.is_nan() {
                 return Err(DenoiseError::Statistics {
@@ -91,12 +106,13 @@ impl Bundle {
     }
 }
 
-/// Root mean square of `(x - mean) / std` over the pixels with `mask` > 0, or over all pixels
-/// without a mask; 0 for no pixels.
-fn rms_z(plane: &[f32], mask: Option<&[f32]>, mean: f64, std: f64) -> f64 {
+/// Root mean square of `(x - mean) / std`, with x up to `largest`, over the pixels with `mask` > 0, or over
+/// all pixels without a mask; 0 for no pixels.
+fn rms_z(plane: &[f32], mask: Option<&[f32]>, largest: f32, [mean, std]: [f64; 2]) -> f64 {
     let (mut sum, mut count) = (0.0, 0_usize);
     for (pixel, &x) in plane.iter().enumerate() {
         if mask.is_none_or(|mask| mask[pixel] > 0.0) {
+            let x = if x > largest { largest } else { x };
             sum += ((f64::from(x) - mean) / std).powi(2);
             count += 1;
         }
@@ -153,9 +169,11 @@ mod tests {
         assert!(bundle.check_statistics(&frame).is_err(), "two hits");
 
         frame.mask = Some(vec![0.0; 64]);
-        frame.features[6 * 64..7 * 64].fill(1000.0);
+        frame.features[6 * 64..7 * 64].fill(-1000.0);
         let error = bundle.check_statistics(&frame).expect_err("a texture");
         assert!(error.to_string().contains("texture1.r"), "{error}");
+        frame.features[6 * 64..7 * 64].fill(65504.0);
+        assert!(bundle.check_statistics(&frame).is_ok(), "counts as 1");
 
         frame.mask = Some(vec![1.0; 63]);
         let error = bundle.check_statistics(&frame).expect_err("a short mask");

@@ -3,8 +3,8 @@
 //!
 //! As in [`crate::denoise`], an image of constant albedo keeps it.
 
+use demc_data::image::frame::MAX_ALBEDO;
 use demc_data::image::frame::{FEATURES as FEATURE_CHANNELS, TEXTURES};
-use demc_data::input::transform::MAX_ALBEDO;
 use demc_model::config::COLOR_CHANNELS;
 
 use super::graph::{AttributeValue, GraphBuilder, Value};

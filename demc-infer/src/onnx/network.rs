@@ -7,8 +7,8 @@
 use burn::nn::BatchNorm;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
 use demc_data::Normalizer;
+use demc_data::image::frame::MAX_ALBEDO;
 use demc_data::image::frame::TEXTURES;
-use demc_data::input::transform::MAX_ALBEDO;
 use demc_model::config::{COLOR_CHANNELS, FEATURE_CHANNELS, Input};
 use demc_model::decoder::DecoderLevel;
 use demc_model::encoder::EncoderLevel;

@@ -13,10 +13,9 @@ use std::path::Path;
 
 use demc_program::parallel;
 
-use crate::dataset::{Dataset, Scene};
+use crate::dataset::{Dataset, preset_of};
 use crate::error::Error;
-use crate::image::exr::ExrFile;
-use crate::image::layout::{ChannelLayout, MissingPolicies, detect};
+use crate::image::layout::ChannelLayout;
 use finding::{Finding, grouped};
 
 pub use finding::{Affected, Problem, Report};
@@ -37,7 +36,7 @@ pub fn examine(root: &Path, layout: Option<&str>, patch_size: usize) -> Result<R
             problems: vec!["manifest.json lists no scenes".to_owned()],
         });
     }
-    let name = layout.unwrap_or_else(|| layout_of(&scenes));
+    let name = layout.unwrap_or_else(|| preset_of(&scenes));
     let layout = ChannelLayout::resolve(name)?;
 
     let mut findings = set::of_manifest(&scenes);
@@ -66,13 +65,4 @@ pub fn examine(root: &Path, layout: Option<&str>, patch_size: usize) -> Result<R
         scenes: scenes.len(),
         problems: grouped(findings),
     })
-}
-
-fn layout_of(scenes: &[Scene]) -> &'static str {
-    let fitting = |scene: &Scene| {
-        let file = ExrFile::open(&scene.path).ok()?;
-        let found = detect(&file, MissingPolicies::default(), None).ok()?;
-        Some(found.preset)
-    };
-    scenes.iter().find_map(fitting).unwrap_or("demc-exr")
 }

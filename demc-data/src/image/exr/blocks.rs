@@ -169,6 +169,21 @@ impl<R: Read + Seek> BlockReader<R> {
         Ok(offsets.map(|&bytes| u64::from_le_bytes(bytes)).collect())
     }
 
+    /// Checks that all blocks of a part are in the file: that each has an offset, and that the last one is
+    /// complete.
+    pub(super) fn check_whole(&mut self, part: usize) -> Result<(), ExrError> {
+        let offsets = self.offsets(part)?;
+        if offsets.iter().any(|offset| *offset < self.blocks) {
+            return Err(incomplete_table());
+        }
+        let places = self.meta.headers[part].enumerate_ordered_blocks();
+        let Some((index, tile)) = places.max_by_key(|(index, _)| offsets.get(*index)) else {
+            return Ok(());
+        };
+        let offset = offsets.get(index).copied().ok_or_else(incomplete_table)?;
+        self.chunk(part, offset, tile.location).map(drop)
+    }
+
     /// Reads the block at an offset, still compressed, and checks that it belongs to `place`.
     pub(super) fn chunk(
         &mut self,
@@ -177,9 +192,7 @@ impl<R: Read + Seek> BlockReader<R> {
         place: TileCoordinates,
     ) -> Result<Chunk, ExrError> {
         if offset < self.blocks || offset >= self.length {
-            return Err(invalid(
-                "its table of blocks is incomplete or damaged".to_owned(),
-            ));
+            return Err(incomplete_table());
         }
         self.reader.seek(SeekFrom::Start(offset))?;
         let several = self.meta.requirements.is_multilayer();
@@ -238,6 +251,10 @@ impl<R: Read + Seek> BlockReader<R> {
             },
         })
     }
+}
+
+fn incomplete_table() -> ExrError {
+    invalid("its table of blocks is incomplete or damaged".to_owned())
 }
 
 type BlockKey = (usize, BlockPosition);

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::io::{Read, Seek};
 
-use ::exr::meta::attribute::{ChannelList, LevelMode, SampleType};
+use ::exr::meta::attribute::{AttributeValue, ChannelList, LevelMode, SampleType};
 use ::exr::meta::header::Header;
 use ::exr::meta::{BlockDescription, Headers};
 
@@ -16,7 +16,7 @@ use crate::image::channel::Channel;
 
 /// Options for writing a denoised image.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct WriteOptions {
+pub struct WriteOptions<'a> {
     /// Channels of the input to keep.
     pub channels: OutputChannels,
     /// Type of the channels of colour and layers; `None`: as in the input (`float` instead of `uint`).
@@ -24,7 +24,12 @@ pub struct WriteOptions {
     /// Compression of the parts with colour; `None`: as in the input. If that would change other
     /// channels or cannot be written, [`Compression::Zip`].
     pub compression: Option<Compression>,
+    /// Text of the header attribute [`RECORD`] of parts with colour: how the image was made.
+    pub record: Option<&'a str>,
 }
+
+/// The header attribute for [`WriteOptions::record`].
+pub const RECORD: &str = "demc.options";
 
 /// Channels of the input to keep in the output.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -275,9 +280,13 @@ fn colored_header(
         tiles.level_mode = LevelMode::Singular;
         changes.push(Change::Levels { part });
     }
-    let header = Header {
+    let mut header = Header {
         channels,
         ..input.clone()
     };
+    if let Some(record) = options.record {
+        let attributes = &mut header.own_attributes.other;
+        attributes.insert(RECORD.into(), AttributeValue::Text(record.into()));
+    }
     header.with_encoding(compression, blocks, input.line_order)
 }

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use ::exr::block::UncompressedBlock;
 use ::exr::error::Error as ExrError;
-use ::exr::meta::attribute::{SampleType, Text};
+use ::exr::meta::attribute::{AttributeValue, SampleType, Text};
 use ::exr::meta::header::Header;
 use ::exr::prelude::Vec2;
 use demc_program::file::FileError;
@@ -95,6 +95,27 @@ impl<R: Read + Seek> ExrFile<R> {
     /// The channel with this name; the first one if there are several.
     pub fn channel(&self, name: &str) -> Option<&Channel> {
         self.by_name.get(name).map(|index| &self.channels[*index])
+    }
+
+    /// The text of a header attribute, of the first part that has it.
+    pub fn attribute(&self, name: &str) -> Option<String> {
+        let mut parts = self.source.meta.headers.iter();
+        parts.find_map(
+            |header| match header.own_attributes.other.get(name.as_bytes()) {
+                Some(AttributeValue::Text(text)) => Some(text.to_string()),
+                _ => None,
+            },
+        )
+    }
+
+    /// Checks that the file ends after its last block of pixels, without decoding any.
+    ///
+    /// # Errors
+    /// [`Error::Exr`] if blocks are missing or cut off.
+    pub fn check_whole(&mut self) -> Result<(), Error> {
+        guarded(&self.path, || {
+            (0..self.source.meta.headers.len()).try_for_each(|part| self.source.check_whole(part))
+        })
     }
 
     /// Checks that the file has all these channels.

@@ -12,6 +12,10 @@ pub const POSITIONS: usize = 3;
 /// Index of the first texture channel; normals and positions come before it.
 pub const TEXTURES: usize = 6;
 
+/// Largest albedo: larger values count as this, in statistics, too. Where a lamp is seen in metal, a renderer
+/// may write 90 or 65504, which demodulation would turn into a spike.
+pub const MAX_ALBEDO: f32 = 1.0;
+
 /// The feature channels in the network's order.
 pub const FEATURE_NAMES: [&str; FEATURES] = [
     "normal.x",

@@ -2,7 +2,7 @@
 
 use std::io::{Read, Seek};
 
-use super::read::finite;
+use super::read::{finite, repair_plane};
 use crate::error::Error;
 use crate::image::channel::ChannelType;
 use crate::image::exr::ExrFile;
@@ -68,7 +68,8 @@ fn role(layout: &ChannelLayout, channel: &str) -> Option<&'static str> {
 /// Returns `[H, W]` for each name.
 ///
 /// # Errors
-/// As `check_layers` and [`ExrFile::read`]; [`Error::NonFinite`] without `repair`.
+/// As `check_layers` and [`ExrFile::read`]; [`Error::NonFinite`] without `repair`, otherwise
+/// [`Error::Unrepairable`].
 pub fn decode_layers<R: Read + Seek>(
     file: &mut ExrFile<R>,
     layout: &ChannelLayout,
@@ -88,7 +89,7 @@ pub fn decode_layers<R: Read + Seek>(
     let mut layers = Vec::with_capacity(names.len());
     for ((mut plane, name), size) in planes.into_iter().zip(names).zip(sizes) {
         if repair {
-            repaired += plane.repair(size, false);
+            repaired += repair_plane(&path, name, &mut plane, size, false)?;
         }
         layers.push(finite(&path, name, size.1, plane)?.to_f32());
     }

@@ -7,7 +7,9 @@ mod channels;
 pub mod layers;
 mod read;
 
-pub use buffers::{FEATURE_NAMES, FEATURES, Frame, FramePlanes, POSITIONS, Presence, TEXTURES};
+pub use buffers::{
+    FEATURE_NAMES, FEATURES, Frame, FramePlanes, MAX_ALBEDO, POSITIONS, Presence, TEXTURES,
+};
 pub use read::{
     check_header, check_open_header, decode_input, decode_repaired, read_frame, read_input,
 };

@@ -45,7 +45,7 @@ pub fn decode_input<R: Read + Seek>(
 /// neighbours ([`Plane::repair`]; negative ones in the colour only). Also returns their number.
 ///
 /// # Errors
-/// As [`read_frame`], without [`Error::NonFinite`].
+/// As [`read_frame`], with [`Error::Unrepairable`] instead of [`Error::NonFinite`].
 pub fn decode_repaired<R: Read + Seek>(
     file: &mut ExrFile<R>,
     layout: &ChannelLayout,
@@ -153,10 +153,9 @@ impl FramePlanes {
         if repair {
             let colors = wanted.color.len();
             let size = (window.height, window.width);
-            let planes = all.iter_mut().enumerate();
-            repaired = planes
-                .map(|(i, plane)| plane.repair(size, i < colors))
-                .sum();
+            for (i, (plane, name)) in all.iter_mut().zip(&names).enumerate() {
+                repaired += repair_plane(path, name, plane, size, i < colors)?;
+            }
         }
         let mut decoded = names
             .iter()
@@ -214,6 +213,37 @@ pub fn check_open_header<R: Read + Seek>(
 ) -> Result<Window, Error> {
     let layout = &*layout.in_file(file, None)?;
     FrameChannels::new(file, layout, reference, Presence::IfPresent)?.window(file.path(), file)
+}
+
+/// Largest share of a channel that is repaired, in percent (ours: a channel of NaN is a mistake, and would
+/// become black or flat).
+const MOST_REPAIRED: u32 = 10;
+
+/// Repairs a channel as [`Plane::repair`].
+///
+/// # Errors
+/// [`Error::Unrepairable`].
+pub(super) fn repair_plane(
+    path: &Path,
+    name: &str,
+    plane: &mut Plane,
+    size: (usize, usize),
+    negative: bool,
+) -> Result<usize, Error> {
+    let (samples, count) = (
+        plane.len(),
+        plane.non_finite().map_or(0, |found| found.count),
+    );
+    if 100 * count > MOST_REPAIRED as usize * samples {
+        return Err(Error::Unrepairable {
+            path: path.to_owned(),
+            channel: name.to_owned(),
+            count,
+            samples,
+            percent: MOST_REPAIRED,
+        });
+    }
+    Ok(plane.repair(size, negative))
 }
 
 /// The plane, if no sample is NaN or infinite.

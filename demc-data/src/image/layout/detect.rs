@@ -231,6 +231,13 @@ pub fn detect<R: Read + Seek>(
             }
         }
     }
+    if let Some(layer) = layer
+        && fits.is_empty()
+        && !has_view_layers(file)
+    {
+        let detail = format!("view layer {layer:?}: the file has no view layers; omit the name");
+        return Err(problem(file, detail));
+    }
     let buffers = |fit: &FileLayout| 4 - fit.absent().len();
     let most = fits.iter().map(buffers).max();
     fits.retain(|fit| Some(buffers(fit)) == most);
@@ -263,6 +270,14 @@ pub fn detect<R: Read + Seek>(
             }
         },
     ))
+}
+
+/// Whether a preset finds a view layer in a file.
+fn has_view_layers<R: Read + Seek>(file: &ExrFile<R>) -> bool {
+    PRESETS.iter().any(|(preset, text)| {
+        let pattern = ChannelLayout::from_toml(preset, text).expect("presets are valid");
+        !pattern.layers(file).is_empty()
+    })
 }
 
 /// The preset with the most channels of a file, if none fits.

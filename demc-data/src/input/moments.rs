@@ -1,13 +1,21 @@
-//! Mean and standard deviation of a channel's samples, in double precision; medians.
+//! Mean and standard deviation of a channel's samples, in double precision.
 
-/// Number of channels that exclude misses: normal xyz and position xyz, which are undefined without
-/// a hit.
-const GEOMETRY: usize = 6;
+use crate::image::frame::{MAX_ALBEDO, TEXTURES};
 
-/// The samples of a feature channel for statistics; for normals and positions only pixels with a
-/// hit.
-pub(crate) fn hit_samples(channel: usize, mut samples: Vec<f32>, mask: Option<&[f32]>) -> Vec<f32> {
-    if let Some(mask) = mask.filter(|_| channel < GEOMETRY) {
+/// The samples of a feature channel for statistics, as the network sees them: normals and positions
+/// of pixels with a hit, and albedo up to `MAX_ALBEDO`.
+pub(crate) fn counted_samples(
+    channel: usize,
+    mut samples: Vec<f32>,
+    mask: Option<&[f32]>,
+) -> Vec<f32> {
+    if channel >= TEXTURES {
+        for sample in &mut samples {
+            *sample = sample.min(MAX_ALBEDO);
+        }
+    }
+    // Normals and positions are undefined without a hit.
+    if let Some(mask) = mask.filter(|_| channel < TEXTURES) {
         let mut mask = mask.iter();
         samples.retain(|_| mask.next().is_some_and(|share| *share > 0.0));
     }
@@ -51,17 +59,6 @@ impl ChannelMoments {
 
     pub(crate) fn std(&self) -> f64 {
         (self.squares / self.count.max(1.0)).sqrt()
-    }
-}
-
-/// The upper median; `None` of nothing.
-pub(crate) fn median(values: impl Iterator<Item = f32>) -> Option<f32> {
-    let mut values: Vec<f32> = values.collect();
-    let middle = values.len() / 2;
-    if values.is_empty() {
-        None
-    } else {
-        Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
     }
 }
 
