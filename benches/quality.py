@@ -55,7 +55,7 @@ def scores_of(data: pathlib.Path, model: tuple[str, pathlib.Path], work: pathlib
             (images / "complete").touch()
         baselines += ["--baseline", f"{peer}={images}"]
     report = work / f"{name}.json"
-    run(program, "evaluate", "--model", path, "--data", data, "--metrics", "flip,energy-bias", "--json", report, *baselines)
+    run(program, "evaluate", "--model", path, "--data", data, "--metrics", "flip,energy-bias", "--json", report, "--overwrite", *baselines)
     images = json.loads(report.read_text())["images"]
     return {image["name"]: {"noisy": image["noisy"], name: image["denoised"]} | image["baselines"] for image in images}
 

@@ -58,7 +58,7 @@ def main() -> None:
             for program, times in seconds.items():
                 page.unlink(missing_ok=True)
                 start = time.monotonic()
-                subprocess.run([program, "report", "--data", folder, "-o", page], check=True, capture_output=True)
+                subprocess.run([program, "report", "--data", folder, "-o", page, "--overwrite"], check=True, capture_output=True)
                 times.append(time.monotonic() - start)
         size = page.stat().st_size
     for program, times in seconds.items():

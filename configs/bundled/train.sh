@@ -84,11 +84,11 @@ else
     render_albedo
 fi
 train albedo
-demc-infer export --model runs/bundled/albedo -o $filter
+demc-infer export --overwrite --model runs/bundled/albedo -o $filter
 
 [ -n "$steps" ] || render_train
 for stage in quality-1 quality-2 quality-3 fast-1 fast-2 fast-3; do
     train $stage
 done
-demc-infer export --model runs/bundled/quality-3 --albedo-filter $filter --precision f16 -o runs/bundled/quality.safetensors
-demc-infer export --model runs/bundled/fast-3 --precision f16 -o runs/bundled/fast.safetensors
+demc-infer export --overwrite --model runs/bundled/quality-3 --albedo-filter $filter --precision f16 -o runs/bundled/quality.safetensors
+demc-infer export --overwrite --model runs/bundled/fast-3 --precision f16 -o runs/bundled/fast.safetensors

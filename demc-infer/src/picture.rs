@@ -140,12 +140,20 @@ impl Picture {
     /// # Errors
     /// The picture has no pixels, or is too large for PNG.
     pub fn to_png(&self) -> Result<Vec<u8>, png::EncodingError> {
+        self.to_png_with(&[])
+    }
+
+    /// As [`to_png`](Self::to_png), with texts by keyword.
+    fn to_png_with(&self, texts: &[(&str, &str)]) -> Result<Vec<u8>, png::EncodingError> {
         let mut bytes = Vec::new();
         let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
         let mut encoder = png::Encoder::new(&mut bytes, side(self.width), side(self.height));
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(png::BitDepth::Eight);
         encoder.set_source_gamma(png::ScaledFloat::new(1.0 / DISPLAY_GAMMA));
+        for (keyword, text) in texts {
+            encoder.add_text_chunk((*keyword).to_owned(), (*text).to_owned())?;
+        }
         let mut writer = encoder.write_header()?;
         writer.write_image_data(self.rgb.as_flattened())?;
         writer.finish()?;
@@ -157,8 +165,18 @@ impl Picture {
     /// # Errors
     /// As [`to_png`](Self::to_png), or the path cannot be written.
     pub fn write_png(&self, path: &Path) -> Result<(), FileError> {
+        self.write_png_with(path, &[])
+    }
+
+    /// As [`write_png`](Self::write_png), with texts by keyword.
+    pub(crate) fn write_png_with(
+        &self,
+        path: &Path,
+        texts: &[(&str, &str)],
+    ) -> Result<(), FileError> {
         write_whole(path, |file| {
-            io::Write::write_all(file, &self.to_png().map_err(io::Error::other)?)
+            let bytes = self.to_png_with(texts).map_err(io::Error::other)?;
+            io::Write::write_all(file, &bytes)
         })
     }
 }

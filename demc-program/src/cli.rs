@@ -9,12 +9,20 @@
 
 use std::ffi::OsString;
 
-use clap::Parser;
+use clap::{Args, Parser};
 
 use crate::exit::{FAILURE, USAGE, UsageError};
 use crate::message::say;
 use crate::output::OutputError;
 use crate::parallel::threads;
+
+/// `--overwrite`, which every program needs to replace an existing output.
+#[derive(Args, Clone, Copy, Debug)]
+pub struct OverwriteFlag {
+    /// Replace existing outputs. Inputs are never replaced
+    #[arg(long)]
+    pub overwrite: bool,
+}
 
 /// Runs a program with its name and arguments: parses them, runs `work`, and reports its error.
 /// Returns the exit code, which is that of `work` unless it fails.

@@ -244,12 +244,15 @@ pub(crate) fn target_of(path: &Path) -> io::Result<PathBuf> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(path.to_owned()),
         found => found?,
     };
+    // A pipe behind `/dev/stdout` has no canonical path.
+    if fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+        return refused("not a regular file");
+    }
     match fs::canonicalize(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => {
             refused("a symbolic link without a target")
         }
         Ok(target) if target.is_dir() => refused("is a directory; name a file"),
-        Ok(target) if !fs::metadata(&target)?.is_file() => refused("not a regular file"),
         target => target,
     }
 }

@@ -43,7 +43,8 @@ class Writer:
 WRITERS = [
     Writer("train", 1, TRAIN, ["kill"], ["--resume"]),
     Writer("denoise", 3, ["demc-infer", "denoise", "many", "-o", "kill", "--png", *MODEL], ["kill"]),
-    Writer("report", 2, ["demc-infer", "report", "--data", "data", "-o", "kill.html", *MODEL], ["kill.html"]),
+    Writer("report", 2, ["demc-infer", "report", "--data", "data", "-o", "kill.html", *MODEL], ["kill.html"],
+           ["--overwrite"]),
     Writer("index", 3, ["demc-data", "index", "many"], ["many/manifest.json"], ["--overwrite"]),
     Writer("merge", 4, ["demc-data", "merge", "x=frame.exr", "bare/scene.exr", "-o", "kill.exr"], ["kill.exr"],
            ["--overwrite"]),

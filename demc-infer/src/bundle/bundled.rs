@@ -26,13 +26,14 @@ impl Bundled {
     }
 
     /// The bundled model that `path` names.
-    pub(super) fn named(path: &Path) -> Option<Self> {
+    pub fn named(path: &Path) -> Option<Self> {
         Self::ALL
             .into_iter()
             .find(|model| path.as_os_str() == model.name())
     }
 
-    pub(super) const fn bytes(self) -> &'static [u8] {
+    /// The bytes of its file.
+    pub const fn bytes(self) -> &'static [u8] {
         match self {
             Self::Quality => include_bytes!("../../../models/quality.safetensors"),
             Self::Fast => include_bytes!("../../../models/fast.safetensors"),

@@ -30,6 +30,7 @@ use std::path::Path;
 
 use burn::tensor::Device;
 use demc_model::{Weights, WeightsError};
+use demc_program::checksum::sha256;
 
 pub use bundled::Bundled;
 pub(crate) use encode::Description;
@@ -49,6 +50,15 @@ impl Bundle {
         let bytes = self.to_bytes(names, precision)?;
         demc_program::file::write_whole(path, |file| file.write_all(&bytes))?;
         Ok(())
+    }
+
+    /// The SHA-256 of the bundle's file, in 64 hexadecimal digits: equal for equal bundles.
+    ///
+    /// # Errors
+    /// None for a bundle that was loaded.
+    pub(crate) fn checksum(&self) -> Result<String, BundleError> {
+        let bytes = self.to_bytes(Names::Burn, Precision::F32)?;
+        Ok(sha256([bytes.as_slice()]))
     }
 
     /// The bytes of the bundle's file. Equal bundles give equal bytes.

@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use demc_data::check::noise::{CORRELATED, correlation};
 use demc_data::image::exr::ExrFile;
+use demc_data::image::frame::MAX_ALBEDO;
 use demc_data::image::frame::{FEATURE_NAMES, TEXTURES, decode_input};
 use demc_data::input::ranges::Range;
-use demc_data::input::transform::MAX_ALBEDO;
 use demc_data::{Frame, FrameSummary};
 use demc_program::message::{self, printable};
 use serde::Serialize;
@@ -23,7 +23,7 @@ use crate::Bundle;
 /// Compare images with a model's training data: statistics of each channel, and warnings.
 ///
 /// `denoise` prints the same warnings. The exit code is 1 if an image has a warning or
-/// cannot be read. JSON then has its error.
+/// cannot be read. JSON then has its error. Notes do not change the exit code.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer check noisy.exr
@@ -61,6 +61,8 @@ struct FileCheck {
     input_scale: f32,
     channels: Vec<ChannelCheck>,
     warnings: Vec<String>,
+    /// What is normal for a renderer.
+    notes: Vec<String>,
 }
 
 /// A value of the image, and its range over the training scenes if the model has it.
@@ -124,7 +126,7 @@ impl Arguments {
                 format!("{failed} of {images} images were not checked"),
             ),
             (warned, format!("{warned} of {images} images have warnings")),
-            (incomplete, format!("{incomplete} sequence(s) lack frames")),
+            (incomplete, format!("{incomplete} input(s) lack images")),
         ];
         let problems: Vec<String> = counts
             .into_iter()
@@ -141,7 +143,8 @@ impl FileCheck {
     fn new(path: &Path, bundle: &Bundle, layouts: &Layouts) -> anyhow::Result<(Self, usize)> {
         let mut file = ExrFile::open(path)?;
         let layout = layouts.of(&file, bundle, say)?;
-        let frame = decode_input(&mut file, &layout)?;
+        let mut frame = decode_input(&mut file, &layout)?;
+        frame.name = path.display().to_string();
         let FrameSummary {
             exposure,
             mean,
@@ -162,7 +165,6 @@ impl FileCheck {
             .into_iter()
             .map(|warning| warning.to_string())
             .collect();
-        warnings.extend(bright_albedo(&frame));
         warnings.extend(correlated_noise(&frame));
         if let Err(refused) = bundle.check_statistics(&frame) {
             warnings.push(format!("`denoise` refuses this image: {refused}"));
@@ -173,6 +175,7 @@ impl FileCheck {
             input_scale: bundle.input_scale(exposure),
             channels: channels.collect(),
             warnings,
+            notes: bright_albedo(&frame).into_iter().collect(),
         };
         Ok((checked, frame.clamped))
     }
@@ -218,16 +221,18 @@ impl FileCheck {
                     )
                 }),
         );
-        lines.extend(
-            self.warnings
-                .iter()
-                .map(|warning| format!("warning: {}", printable(warning))),
-        );
+        for (kind, found) in [("warning", &self.warnings), ("note", &self.notes)] {
+            lines.extend(
+                found
+                    .iter()
+                    .map(|text| format!("{kind}: {}", printable(text))),
+            );
+        }
         lines.join("\n") + "\n"
     }
 }
 
-/// A warning about albedo above [`MAX_ALBEDO`].
+/// A note about albedo above [`MAX_ALBEDO`]: renderers write it where a lamp is seen in metal.
 fn bright_albedo(frame: &Frame) -> Option<String> {
     let pixels = frame.width * frame.height;
     let above = |value: &&f32| **value > MAX_ALBEDO;
@@ -236,8 +241,7 @@ fn bright_albedo(frame: &Frame) -> Option<String> {
     let largest = textures.fold(0.0, |largest: f32, value| largest.max(*value));
     (bright > 0).then(|| {
         format!(
-            "albedo: {bright} samples are above {MAX_ALBEDO}, up to {largest:.1}, and count as {MAX_ALBEDO}; \
-             is a lamp seen in metal, or is this another buffer?"
+            "albedo: {bright} samples are above {MAX_ALBEDO}, up to {largest:.1}, and count as {MAX_ALBEDO}"
         )
     })
 }

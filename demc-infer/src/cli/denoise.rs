@@ -7,6 +7,7 @@ use clap::{Args, ValueEnum};
 use demc_data::image::exr::{Compression, ExrFile};
 use demc_data::image::frame::{decode_input, decode_repaired};
 use demc_data::image::rewrite::{OutputChannels, Replaced, WriteOptions, rewrite_with_layers};
+use demc_data::input::ranges;
 use demc_data::{ChannelLayout, Frame};
 use demc_program::message;
 use demc_program::output::{Directories, Outputs};
@@ -19,12 +20,14 @@ use super::inputs::Inputs;
 use super::jobs::{Job, Jobs};
 use super::layers::{LayersFlag, read_layers};
 use super::layouts::{LayoutFlags, Layouts};
+use super::preview;
 use super::progress::Progress;
+use super::record::Record;
 use super::shard::Shard;
 use super::warnings::Warnings;
 use crate::denoise::{DenoiseOptions, DenoiseProgress, Layer, SeamError};
 use crate::guard::{EnergyBias, Warning};
-use crate::{Bundle, Picture, memory};
+use crate::{Bundle, Ensemble, memory};
 
 /// Largest cache of an input's decoded blocks in bytes, kept until its output is written (ours:
 /// three times 19 half channels of 1920x1080). Blocks beyond it are decompressed twice.
@@ -43,7 +46,7 @@ fn cache_bytes() -> usize {
 /// finished directory.
 ///
 /// Channels have the names of the model's training data, or those that Mitsuba, pbrt, Blender
-/// Cycles or FBKSD write. --layout chooses other names. An image that differs from the training
+/// Cycles, LuxCore or FBKSD write. --layout chooses other names. An image that differs from the training
 /// data causes a warning with the likely cause. Negative radiance counts as 0.
 ///
 /// The output is the input with denoised colour and layers. Parts, windows, attributes, compression and all
@@ -71,15 +74,16 @@ pub struct Arguments {
     /// frame sequences (shot.####.exr or shot.%04d.exr)
     #[arg(value_name = "IN.exr", required = true)]
     inputs: Vec<PathBuf>,
-    /// Output file for one input, output directory for several. A directory is created if needed;
-    /// images that exist in it are skipped, unless their input is newer
+    /// Output file for one input, NAME.exr, or output directory. Directories are created if needed. Images that
+    /// exist are skipped, unless their input is newer
     #[arg(short, long, value_name = "OUT")]
     output: PathBuf,
     /// Replace NaN, infinite and negative samples by the median of their neighbours. Without it, an
     /// image with NaN or infinite samples is refused, and negative radiance counts as 0
     #[arg(long)]
     repair: bool,
-    /// Replace existing outputs and previews. Inputs are never replaced
+    /// Replace existing outputs and previews, also those of other options or of another program. Inputs are
+    /// never replaced
     #[arg(long)]
     overwrite: bool,
     /// Only these frames of sequences, such as 7, 1-240, or 1-10,15,20-40x2 (every second one)
@@ -87,11 +91,11 @@ pub struct Arguments {
     frames: Option<Frames>,
     /// Only part I of N of the images, from 1/N to N/N: sorted by file name, the Ith and every Nth
     /// after it
-    #[arg(long, value_name = "I/N")]
+    #[arg(long, value_name = "I/N", allow_hyphen_values = true)]
     shard: Option<Shard>,
     #[command(flatten)]
     output_flags: OutputFlags,
-    /// Also write a preview NAME.png beside each output, unless it exists: clip(2^EXPOSURE x, 0, 1)^(1/2.2)
+    /// Also write a preview NAME.png of each output beside it: clip(2^EXPOSURE x, 0, 1)^(1/2.2)
     #[arg(long)]
     png: bool,
     /// Exposure of previews in stops
@@ -132,23 +136,21 @@ impl Arguments {
         let mut outputs = Outputs::default();
         self.model.protect(&mut outputs);
         self.layout.protect(&mut outputs);
-        jobs.claim(&mut outputs, self.overwrite)?;
-        if !self.overwrite {
-            jobs.skip_done(&mut outputs);
-        }
-        jobs.report_skipped();
+        jobs.claim(&mut outputs)?;
         let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
         self.layers.check(&bundle, self.ensemble.passes)?;
-        outputs.prepare(if jobs.directory {
-            Directories::Create
-        } else {
-            Directories::Expect
-        })?;
+        let record = self.record(&bundle)?;
+        if !self.overwrite {
+            jobs.skip_existing(&record, self.exposure, &mut outputs);
+        }
+        let kept = jobs.report_skipped()?;
+        outputs.prepare(Directories::Create)?;
         let jobs = jobs.list;
         let work = Work {
             bundle,
             layouts,
+            record: record.text(),
             progress: Progress::new(jobs.len()),
             warnings: Warnings::default(),
         };
@@ -163,13 +165,13 @@ impl Arguments {
         let mut failed = 0;
         for job in &jobs {
             progress.start(job.input.display());
-            let scale = match self.input_scale.choice.factor() {
-                None => scales.of(&job.input, bundle, layouts),
-                given => given,
+            let exposure = match self.input_scale.choice.factor() {
+                None => scales.exposure(&job.input, bundle, layouts),
+                Some(_) => None,
             };
-            match self.image(&work, job, scale) {
+            match self.image(&work, job, exposure) {
                 Ok(samples) => clamped.count(samples),
-                Err(error) if jobs.len() == 1 => return Err(error),
+                Err(error) if jobs.len() == 1 && kept == 0 => return Err(error),
                 Err(error) => {
                     failed += 1;
                     progress.line(format_args!("error: {error:#}"));
@@ -187,23 +189,75 @@ impl Arguments {
             "{failed} of {} images were not denoised",
             jobs.len()
         );
-        anyhow::ensure!(incomplete == 0, "{incomplete} sequence(s) lack frames");
+        anyhow::ensure!(kept == 0, "{kept} existing file(s) were kept");
+        anyhow::ensure!(incomplete == 0, "{incomplete} input(s) lack images");
         Ok(())
     }
 
-    /// Denoises one image, by default with the scale of its own exposure. Returns the number of
-    /// negative samples, which were set to 0.
-    fn image(&self, work: &Work, job: &Job, input_scale: Option<f32>) -> anyhow::Result<usize> {
+    /// The options that change an output.
+    fn record(&self, bundle: &Bundle) -> anyhow::Result<Record> {
+        let mut record = Record::of_model(&self.model.name(), &bundle.checksum()?);
+        self.layout.record(&mut record);
+        self.layers.record(&mut record);
+        self.output_flags.record(&mut record);
+        if self.repair {
+            record.add("--repair", "on");
+        }
+        if let Some(factor) = self.input_scale.choice.factor() {
+            record.add("--input-scale", factor);
+        }
+        if self.ensemble.passes != Ensemble::One {
+            record.add("--ensemble", self.ensemble.passes.count());
+        }
+        if let Some(restore) = self.light.restore_light {
+            record.add("--restore-light", if restore { "on" } else { "off" });
+        }
+        self.tiling.record(&mut record);
+        Ok(record)
+    }
+
+    /// Denoises one image if its output is due, and writes its preview. Returns the number of negative
+    /// samples, which were set to 0.
+    fn image(&self, work: &Work, job: &Job, exposure: Option<f64>) -> anyhow::Result<usize> {
         let Work {
             bundle,
             layouts,
             progress,
-            warnings,
+            ..
         } = work;
         let name = job.input.display();
         let file = ExrFile::open(&job.input)?;
         let say = |choice: &str| progress.line(format_args!("note: {name}: {choice}"));
         let layout = &layouts.of(&file, bundle, say)?;
+        let clamped = if job.is_due {
+            self.denoise(work, job, file, layout, exposure)?
+        } else {
+            0
+        };
+        if let Some(path) = &job.preview {
+            preview::write(path, &job.output, layout, self.exposure)?;
+        }
+        Ok(clamped)
+    }
+
+    /// Denoises one image with the factor for `exposure`, by default its own. Returns the number of negative
+    /// samples, which were set to 0.
+    fn denoise(
+        &self,
+        work: &Work,
+        job: &Job,
+        file: ExrFile,
+        layout: &ChannelLayout,
+        exposure: Option<f64>,
+    ) -> anyhow::Result<usize> {
+        let Work {
+            bundle,
+            progress,
+            warnings,
+            record,
+            ..
+        } = work;
+        let name = job.input.display();
         let names = self.layers.names(&file, layout)?;
         let mut file = file.keeping(&layout.color, cache_bytes());
         let Contents {
@@ -220,11 +274,13 @@ impl Arguments {
             }
         };
         bundle.warnings(&frame)?.iter().for_each(warn);
+        far_from_sequence(&frame, exposure).iter().for_each(warn);
         let tiling = self.tiling.tiling();
+        let given = self.input_scale.choice.factor();
         let options = DenoiseOptions {
             tiling,
             ensemble: self.ensemble.passes,
-            input_scale,
+            input_scale: given.or(exposure.map(|exposure| bundle.input_scale(exposure))),
             restore_light: self.light.restore_light,
             layers,
         };
@@ -250,13 +306,6 @@ impl Arguments {
             .warning()
             .iter()
             .for_each(warn);
-        if let Some(path) = &job.preview {
-            let exposed: Vec<f32> = image.iter().map(|x| x * self.exposure.exp2()).collect();
-            Picture::from_hdr(&exposed, frame.height, frame.width).write_png(path)?;
-        }
-        let Some(output) = &job.output else {
-            return Ok(frame.clamped);
-        };
         let mut planes = denoised.color_hdr;
         planes.extend(denoised.alpha.into_iter().flatten());
         planes.extend(denoised.layers);
@@ -265,7 +314,10 @@ impl Arguments {
             layers: &names,
             planes: &planes,
         };
-        for note in self.output_flags.write(&mut file, output, &replaced)? {
+        for note in self
+            .output_flags
+            .write(&mut file, &job.output, &replaced, record)?
+        {
             progress.line(format_args!("note: {name}: {note}"));
         }
         Ok(frame.clamped)
@@ -283,6 +335,7 @@ impl Arguments {
         } else {
             (decode_input(file, layout)?, 0)
         };
+        frame.name = file.path().display().to_string();
         let (layers, more) = read_layers(file, layout, names, self.repair)?;
         let alpha = layout.alpha.as_ref();
         if alpha.is_some_and(|alpha| names.contains(alpha)) {
@@ -295,6 +348,21 @@ impl Arguments {
             repaired: repaired + more,
         })
     }
+}
+
+/// Largest distance of a frame's exposure from that of its sequence without a warning, in stops (ours).
+const MOST_STOPS: f64 = 2.0;
+
+/// A warning about a frame whose exposure is far from the one that its factor is made for.
+fn far_from_sequence(frame: &Frame, exposure: Option<f64>) -> Option<Warning> {
+    let expected = exposure.filter(|exposure| *exposure > 0.0)?;
+    let stops = (ranges::exposure(&frame.color) / expected).log2();
+    // A black frame is at infinity.
+    (stops.is_finite() && stops.abs() > MOST_STOPS).then(|| Warning {
+        what: "exposure".into(),
+        found: format!("it is {stops:+.1} stops from that of the frames around it"),
+        cause: "the factor of a sequence changes slowly; denoise such a frame by its own name",
+    })
 }
 
 /// The error at seams, in words.
@@ -314,6 +382,8 @@ fn described(error: &SeamError) -> String {
 struct Work<'a> {
     bundle: Bundle,
     layouts: Layouts<'a>,
+    /// Of each output's header.
+    record: String,
     progress: Progress,
     warnings: Warnings,
 }
@@ -351,6 +421,21 @@ enum OutputPrecision {
 }
 
 impl OutputFlags {
+    fn record(&self, record: &mut Record) {
+        if let Some(precision) = self
+            .precision
+            .and_then(|precision| precision.to_possible_value())
+        {
+            record.add("--precision", precision.get_name());
+        }
+        if let Some(compression) = self.compression {
+            record.add("--compression", compression);
+        }
+        if self.only_color {
+            record.add("--only-color", "on");
+        }
+    }
+
     /// Writes `output`: `input` with the denoised channels. Returns notes about other differences
     /// from the input.
     fn write(
@@ -358,6 +443,7 @@ impl OutputFlags {
         input: &mut ExrFile,
         output: &Path,
         replaced: &Replaced,
+        record: &str,
     ) -> Result<Vec<String>, demc_data::Error> {
         let options = WriteOptions {
             channels: if self.only_color {
@@ -370,6 +456,7 @@ impl OutputFlags {
                 OutputPrecision::Float => demc_data::SamplePrecision::Float,
             }),
             compression: self.compression,
+            record: Some(record),
         };
         let written = rewrite_with_layers(input, replaced, output, &options)?;
         let mut notes: Vec<String> = written.changes.iter().map(ToString::to_string).collect();

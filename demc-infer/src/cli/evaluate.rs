@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use demc_model::metrics::{self, METRICS, Metric};
+use demc_program::cli::OverwriteFlag;
 use demc_program::exit::UsageError;
 use demc_program::message;
 use serde::Serialize;
@@ -40,6 +41,8 @@ pub struct Arguments {
     /// Write all metrics as JSON to FILE; `-` prints them on stdout instead of the table
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
+    #[command(flatten)]
+    overwrite: OverwriteFlag,
 }
 
 #[derive(Serialize)]
@@ -54,7 +57,7 @@ impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
         let more = find_metrics(&self.metrics)?;
         if let Some(path) = self.json.as_deref().filter(|path| *path != Path::new("-")) {
-            self.scenes.check_output(path)?;
+            self.scenes.check_output(path, self.overwrite.overwrite)?;
         }
         let report = self.scenes.score(|_, _| Ok(()), |(), _| Ok(()))?;
         // The table comes first, so that a failed write does not lose it.

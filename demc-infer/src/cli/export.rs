@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use burn::tensor::Device;
 use clap::{Args, ValueEnum};
 use demc_data::ChannelLayout;
+use demc_program::cli::OverwriteFlag;
 use demc_program::exit::UsageError;
 use demc_program::message::{self, printable};
 use demc_program::output::Outputs;
@@ -57,9 +58,11 @@ pub struct Arguments {
     /// exported file. A model that has a filter itself gives that one. `none`: no filter
     #[arg(long, value_name = "MODEL|none")]
     albedo_filter: Option<PathBuf>,
-    /// Output file. An existing file is replaced, but never a model that is read
+    /// Output file
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
+    #[command(flatten)]
+    overwrite: OverwriteFlag,
     /// Run the file on synthetic images in ONNX Runtime or PyTorch and compare. Deviations above
     /// 1e-4, or 1e-3 of a value of a kernel head, fail
     #[arg(long)]
@@ -107,7 +110,7 @@ impl Arguments {
         if let Some(python) = &self.python {
             outputs.protect(python, "the Python interpreter");
         }
-        check_output(outputs, &self.output)?;
+        check_output(outputs, &self.output, self.overwrite.overwrite)?;
         let file = self.model.read()?;
         let filter = filter_path.map(BundleFile::read).transpose()?;
         let names = match self.names {

@@ -8,6 +8,7 @@ use clap::Args;
 use demc_data::image::exr::ExrFile;
 use demc_data::input::ranges::exposure;
 
+use super::exposure_curve::ExposureCurve;
 use super::inputs::Sequence;
 use super::layouts::Layouts;
 use crate::Bundle;
@@ -16,8 +17,8 @@ use crate::denoise::MAX_INPUT_SCALE;
 /// `--input-scale`.
 #[derive(Args)]
 pub struct InputScaleFlag {
-    /// Factor on the colour before the network; the result is divided by it. `auto`: 1, unless the
-    /// image or the median frame of its sequence is more than a stop outside the training scenes
+    /// Factor on the colour before the network; the result is divided by it. `auto`: to the exposure of training.
+    /// In a sequence it changes by at most half a stop from frame to frame
     #[arg(
         long = "input-scale",
         value_name = "auto|FACTOR",
@@ -71,38 +72,38 @@ impl FromStr for InputScale {
     }
 }
 
-/// One factor for each sequence.
+/// The factors of the frames of sequences.
 pub struct SequenceScales<'a> {
     sequences: &'a [Sequence],
     /// By the index of the sequence.
-    scales: HashMap<usize, f32>,
+    curves: HashMap<usize, ExposureCurve>,
 }
 
 impl<'a> SequenceScales<'a> {
     pub fn new(sequences: &'a [Sequence]) -> Self {
         Self {
             sequences,
-            scales: HashMap::new(),
+            curves: HashMap::new(),
         }
     }
 
-    /// The factor for the frames of the sequence with `path`; `None` if it is in no sequence.
-    pub fn of(&mut self, path: &Path, bundle: &Bundle, layouts: &Layouts) -> Option<f32> {
-        let mut sequences = self.sequences.iter();
-        let index =
-            sequences.position(|sequence| sequence.files.iter().any(|file| file == path))?;
-        let scale = self.scales.entry(index).or_insert_with(|| {
-            let samples = self.sequences[index].samples.iter();
-            // An unreadable frame is reported when its turn comes.
-            let mut exposures: Vec<f64> = samples
-                .filter_map(|path| exposure_of(path, bundle, layouts).ok())
-                .filter(|exposure| *exposure > 0.0)
-                .collect();
-            exposures.sort_by(f64::total_cmp);
-            let median = exposures.get(exposures.len() / 2);
-            bundle.input_scale(median.copied().unwrap_or(0.0))
+    /// The exposure that the factor for a frame is made for, which hardly changes from frame to frame; `None` for
+    /// an image in no sequence.
+    pub fn exposure(&mut self, path: &Path, bundle: &Bundle, layouts: &Layouts) -> Option<f64> {
+        let place = |sequence: &Sequence| sequence.frames.iter().position(|(_, file)| file == path);
+        let mut sequences = self.sequences.iter().enumerate();
+        let (index, frame) = sequences.find_map(|(i, sequence)| Some((i, place(sequence)?)))?;
+        let frames = &self.sequences[index].frames;
+        let curve = self.curves.entry(index).or_insert_with(|| {
+            let numbers: Vec<u64> = frames.iter().map(|(number, _)| *number).collect();
+            ExposureCurve::measure(&numbers, |frame| {
+                // An unreadable frame is reported when its turn comes.
+                let exposure = exposure_of(&frames[frame].1, bundle, layouts).ok()?;
+                (exposure > 0.0).then(|| exposure.log2())
+            })
         });
-        Some(*scale)
+        let stops = curve.at(frames[frame].0);
+        Some(stops.map_or(0.0, f64::exp2))
     }
 }
 

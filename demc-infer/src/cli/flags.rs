@@ -7,6 +7,7 @@ use demc_data::image::exr::MAX_SIDE;
 use demc_program::exit::UsageError;
 use demc_program::output::Outputs;
 
+use super::record::Record;
 use crate::bundle::locate;
 use crate::compute::ComputeFlags;
 use crate::tiles::EXACT_HALO;
@@ -100,6 +101,13 @@ pub struct TilingFlags {
 }
 
 impl TilingFlags {
+    /// Adds a halo that changes the result to a record.
+    pub fn record(&self, record: &mut Record) {
+        if (self.halo as usize) < EXACT_HALO {
+            record.add("--halo", self.halo);
+        }
+    }
+
     pub fn tiling(&self) -> Tiling {
         Tiling {
             halo: self.halo as usize,

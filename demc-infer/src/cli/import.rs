@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use burn::tensor::Device;
 use clap::Args;
+use demc_program::cli::OverwriteFlag;
 use demc_program::message::{self, printable};
 use demc_program::output::Outputs;
 
@@ -29,9 +30,11 @@ pub struct Arguments {
     /// The model that training started from: run directory, checkpoint directory or exported file
     #[arg(long, value_name = "MODEL")]
     like: Option<PathBuf>,
-    /// Output file. An existing file is replaced, but never an input
+    /// Output file
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
+    #[command(flatten)]
+    overwrite: OverwriteFlag,
 }
 
 impl Arguments {
@@ -41,7 +44,7 @@ impl Arguments {
         for file in self.like.iter().flat_map(|like| locate::files(like)) {
             outputs.protect(&file, "the model");
         }
-        check_output(outputs, &self.output)?;
+        check_output(outputs, &self.output, self.overwrite.overwrite)?;
         let like = match &self.like {
             Some(path) => Some(BundleFile::read(path)?),
             None => None,

@@ -1,6 +1,7 @@
 //! Expands input arguments into files: files, directories, glob patterns, frame sequences.
 
-use std::ffi::OsStr;
+use std::collections::HashSet;
+use std::ffi::{OsStr, OsString};
 use std::fs;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -19,6 +20,8 @@ pub struct Inputs {
     pub several: bool,
     /// The frame sequences among the arguments.
     pub sequences: Vec<Sequence>,
+    /// Says which directories, patterns, and sequences have no images.
+    pub empty: Vec<String>,
 }
 
 /// A frame sequence.
@@ -26,36 +29,40 @@ pub struct Inputs {
 pub struct Sequence {
     /// Its chosen frames.
     pub files: Vec<PathBuf>,
-    /// Up to [`SAMPLES`] of all its frames, evenly spaced: the same for every choice of frames.
-    pub samples: Vec<PathBuf>,
+    /// All its frames by number: the same for every choice of frames.
+    pub frames: Vec<(u64, PathBuf)>,
     /// Names the missing frames, if there are any.
     pub missing: Option<String>,
     /// Says how many chosen frames are after the last one, if there are any.
     pub after: Option<String>,
 }
 
-/// Number of frames from which the exposure of a sequence is measured.
-const SAMPLES: usize = 8;
-
 impl Inputs {
     /// Expands `arguments`.
     ///
-    /// - A file stands for itself, a directory for its `*.exr`, links without a target included.
+    /// - A file stands for itself, a directory for its `*.exr` without hidden ones, links without a target
+    ///   included. A file that stands for several arguments counts once.
     /// - `shot.####.exr` and `shot.%04d.exr` stand for the frames of a sequence.
     /// - Names with `*`, `?` or `[..]` are glob patterns if no such file exists.
     ///
     /// # Errors
-    /// A directory, pattern or sequence without files; `frames` without a sequence.
+    /// A directory that cannot be read; a pattern that cannot be understood; `frames` without a sequence.
     pub fn expand(arguments: &[PathBuf], frames: Option<&Frames>) -> Result<Self, UsageError> {
         let mut files = Vec::new();
         let mut several = arguments.len() > 1;
-        let mut sequences = Vec::new();
+        let (mut sequences, mut empty) = (Vec::new(), Vec::new());
         for argument in arguments {
             let found = if argument.is_file() {
                 vec![argument.clone()]
             } else if argument.is_dir() {
                 several = true;
                 directory(argument)?
+            } else if let Some(field) = padded_with_spaces(argument) {
+                return Err(UsageError(format!(
+                    "{}: {field} pads numbers with spaces; write %0{}",
+                    argument.display(),
+                    &field[1..]
+                )));
             } else if let Some(pattern) = SequencePattern::parse(argument) {
                 several = true;
                 let sequence = pattern.expand(frames)?;
@@ -70,13 +77,16 @@ impl Inputs {
                 vec![argument.clone()]
             };
             if found.is_empty() {
-                return Err(UsageError(format!(
-                    "{}: no images found",
-                    argument.display()
-                )));
+                empty.push(format!(
+                    "{}: no images found{}",
+                    argument.display(),
+                    hint(argument)
+                ));
             }
             files.extend(found);
         }
+        let mut seen = HashSet::new();
+        files.retain(|file| seen.insert(place(file)));
         if frames.is_some() && sequences.is_empty() {
             let message = "--frames needs a sequence among the inputs, such as shot.####.exr";
             return Err(UsageError(message.into()));
@@ -85,21 +95,52 @@ impl Inputs {
             files,
             several,
             sequences,
+            empty,
         })
     }
 
-    /// Reports missing frames of sequences, and notes those after their ends. Returns the number of
-    /// sequences with missing frames.
+    /// Reports arguments without images and missing frames of sequences, and notes those after their ends.
+    /// Returns the number of such arguments.
     pub fn report_missing(&self) -> usize {
+        for empty in &self.empty {
+            message::say(format_args!("error: {empty}"));
+        }
         let after = self.sequences.iter();
         for after in after.filter_map(|sequence| sequence.after.as_ref()) {
             message::say(format_args!("note: {after}"));
         }
-        self.sequences
+        let lacking = self
+            .sequences
             .iter()
             .filter_map(|sequence| sequence.missing.as_ref())
             .inspect(|missing| message::say(format_args!("error: {missing}")))
-            .count()
+            .count();
+        lacking + self.empty.len()
+    }
+}
+
+/// Where a file is: its directory without links, and its name. Two links to one file have two places.
+fn place(file: &Path) -> (PathBuf, OsString) {
+    let parent = match file.parent() {
+        Some(parent) if parent != Path::new("") => parent,
+        _ => Path::new("."),
+    };
+    let directory = fs::canonicalize(parent).unwrap_or_else(|_| parent.to_owned());
+    (directory, file.file_name().unwrap_or_default().to_owned())
+}
+
+/// What may help with a directory that has no images but directories.
+fn hint(argument: &Path) -> String {
+    let entries = entries(argument).unwrap_or_default();
+    match entries.iter().filter(|path| path.is_dir()).count() {
+        0 => String::new(),
+        count => {
+            let pattern = argument.join("*").join("*.exr");
+            format!(
+                " in it; it has {count} directories: try '{}'",
+                pattern.display()
+            )
+        }
     }
 }
 
@@ -107,7 +148,7 @@ fn directory(path: &Path) -> Result<Vec<PathBuf>, UsageError> {
     let mut files: Vec<PathBuf> = entries(path)?
         .into_iter()
         // Reading anything but a file gives the best error.
-        .filter(|file| is_exr(file) && !file.is_dir())
+        .filter(|file| is_exr(file) && !is_hidden(file) && !file.is_dir())
         .collect();
     files.sort();
     Ok(files)
@@ -125,6 +166,11 @@ fn is_exr(path: &Path) -> bool {
     extension.is_some_and(|extension| extension.eq_ignore_ascii_case("exr"))
 }
 
+fn is_hidden(path: &Path) -> bool {
+    let name = path.file_name().map(OsStr::as_encoded_bytes);
+    name.is_some_and(|name| name.starts_with(b"."))
+}
+
 fn is_pattern(path: &Path) -> bool {
     let bytes = path.as_os_str().as_encoded_bytes();
     bytes.iter().any(|byte| b"*?[".contains(byte))
@@ -138,7 +184,12 @@ fn pattern(argument: &Path) -> Result<Vec<PathBuf>, UsageError> {
             &"a pattern must be UTF-8; name the directory instead",
         ));
     };
-    let found = glob::glob(text).map_err(|source| error(&source))?;
+    let options = glob::MatchOptions {
+        // As in a shell.
+        require_literal_leading_dot: true,
+        ..glob::MatchOptions::new()
+    };
+    let found = glob::glob_with(text, options).map_err(|source| error(&source))?;
     let mut files = Vec::new();
     for path in found {
         let path = path.map_err(|source| error(&source))?;
@@ -180,11 +231,7 @@ impl<'a> SequencePattern<'a> {
             .filter_map(|path| Some((self.number(path.file_name()?.to_str()?)?, path)))
             .collect();
         found.sort();
-        let samples = found
-            .iter()
-            .step_by(found.len().div_ceil(SAMPLES).max(1))
-            .map(|(_, path)| path.clone())
-            .collect();
+        let all_found = found.clone();
         let numbers: Vec<u64> = found.iter().map(|(number, _)| *number).collect();
         let (mut missing, mut after) = (None, None);
         if let (Some(&first), Some(&last)) = (numbers.first(), numbers.last()) {
@@ -215,7 +262,7 @@ impl<'a> SequencePattern<'a> {
         }
         Ok(Sequence {
             files: found.into_iter().map(|(_, path)| path).collect(),
-            samples,
+            frames: all_found,
             missing,
             after,
         })
@@ -252,7 +299,15 @@ fn hashes(name: &str) -> Option<NumberField> {
     Some(NumberField { place, digits })
 }
 
-/// `%d`, `%4d` or `%04d`.
+/// A field such as `%4d` in a file name, which is a number padded with spaces.
+fn padded_with_spaces(argument: &Path) -> Option<String> {
+    let name = argument.file_name()?.to_str()?;
+    let field = percent(name)?.place;
+    let is_padded = field.len() > 2;
+    (is_padded && !name[field.start + 1..].starts_with('0')).then(|| name[field].to_owned())
+}
+
+/// `%d` or `%04d`.
 fn percent(name: &str) -> Option<NumberField> {
     let start = name.find('%')?;
     let length = name[start + 1..].find(|c: char| !c.is_ascii_digit())?;
@@ -271,7 +326,9 @@ mod tests {
     fn directory_of(names: &[&str]) -> tempfile::TempDir {
         let dir = tempfile::tempdir().expect("a directory");
         for name in names {
-            fs::write(dir.path().join(name), "").expect("a file");
+            let path = dir.path().join(name);
+            fs::create_dir_all(path.parent().expect("a directory")).expect("a directory");
+            fs::write(path, "").expect("a file");
         }
         dir
     }
@@ -320,18 +377,41 @@ mod tests {
     }
 
     #[test]
-    fn nothing_found_is_an_error_and_a_missing_file_is_not() {
-        let dir = directory_of(&["a.txt"]);
-        for argument in ["", "*.exr", "s.####.exr"] {
-            let error = Inputs::expand(&[dir.path().join(argument)], None).expect_err("nothing");
-            assert!(error.to_string().ends_with("no images found"), "{error}");
+    fn arguments_without_images_are_named_and_others_go_on() {
+        let dir = directory_of(&["a.txt", ".hidden.exr", "sub/b.exr"]);
+        let file = dir.path().join("sub/b.exr");
+        for argument in ["*.exr", "s.####.exr"] {
+            let found = Inputs::expand(&[dir.path().join(argument), file.clone()], None);
+            let found = found.expect("one file");
+            assert_eq!(found.files, std::slice::from_ref(&file));
+            assert!(
+                found.empty[0].ends_with("no images found"),
+                "{:?}",
+                found.empty
+            );
         }
+        let found = Inputs::expand(&[dir.path().to_owned()], None).expect("no file");
+        let hint = format!(
+            "it has 1 directories: try '{}/*/*.exr'",
+            dir.path().display()
+        );
+        assert!(found.empty[0].ends_with(&hint), "{:?}", found.empty);
         let absent = dir.path().join("absent.exr");
         let found = Inputs::expand(std::slice::from_ref(&absent), None).expect("as it is");
         assert_eq!((found.files, found.several), (vec![absent], false));
+        let twice = [dir.path().join("sub"), dir.path().join("sub/../sub/b.exr")];
+        let found = Inputs::expand(&twice, None).expect("as it is");
+        assert_eq!(found.files, [file]);
         let frames = "1-2".parse().ok();
         let error = Inputs::expand(&["a.exr".into()], frames.as_ref()).expect_err("no sequence");
         assert!(error.to_string().starts_with("--frames needs"), "{error}");
+    }
+
+    #[test]
+    fn a_number_padded_with_spaces_is_refused() {
+        let error = Inputs::expand(&["shot.%4d.exr".into()], None).expect_err("spaces");
+        let why = "shot.%4d.exr: %4d pads numbers with spaces; write %04d";
+        assert_eq!(error.to_string(), why);
     }
 
     #[test]

@@ -8,6 +8,7 @@ use demc_program::exit::UsageError;
 use demc_program::message::list;
 use glob::Pattern;
 
+use super::record::Record;
 use crate::denoise::Layer;
 use crate::{Bundle, Ensemble};
 
@@ -25,6 +26,14 @@ fn pattern(text: &str) -> Result<Pattern, String> {
 }
 
 impl LayersFlag {
+    /// Adds the patterns to a record.
+    pub fn record(&self, record: &mut Record) {
+        let patterns: Vec<&str> = self.patterns.iter().map(Pattern::as_str).collect();
+        if !patterns.is_empty() {
+            record.add("--layers", patterns.join(" "));
+        }
+    }
+
     /// Refuses a model or test-time augmentation that does not suit layers.
     pub fn check(&self, bundle: &Bundle, ensemble: Ensemble) -> Result<(), UsageError> {
         if self.patterns.is_empty() {

@@ -11,6 +11,7 @@ use demc_program::exit::UsageError;
 use demc_program::message;
 use demc_program::output::Outputs;
 
+use super::record::Record;
 use crate::Bundle;
 
 /// What a layout file is called in messages about outputs.
@@ -42,6 +43,15 @@ impl LayoutFlags {
     pub fn protect(&self, outputs: &mut Outputs) {
         if let Some(layout) = &self.layout {
             outputs.protect(Path::new(layout), LAYOUT);
+        }
+    }
+
+    /// Adds these flags to a record.
+    pub fn record(&self, record: &mut Record) {
+        for (flag, value) in [("--layout", &self.layout), ("--layer", &self.layer)] {
+            if let Some(value) = value {
+                record.add(flag, value);
+            }
         }
     }
 

@@ -8,9 +8,9 @@ use demc_program::file::write_whole;
 use demc_program::message;
 use demc_program::output::{Directories, OutputError, Outputs};
 
-/// Checks the only output of a command, which may replace a file, but no input.
-pub fn check_output(mut outputs: Outputs, path: &Path) -> Result<(), OutputError> {
-    outputs.claim(path, true)?;
+/// Checks the only output of a command, which replaces an existing file with `overwrite`, but no input.
+pub fn check_output(mut outputs: Outputs, path: &Path, overwrite: bool) -> Result<(), OutputError> {
+    outputs.claim(path, overwrite)?;
     outputs.prepare(Directories::Expect)
 }
 

@@ -4,6 +4,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use clap::Args;
+use demc_program::cli::OverwriteFlag;
 use demc_program::message::{self, printable};
 
 use super::scenes::{Scenes, require_all};
@@ -26,11 +27,14 @@ pub struct Arguments {
     /// Output file
     #[arg(short, long, value_name = "FILE.html")]
     output: PathBuf,
+    #[command(flatten)]
+    overwrite: OverwriteFlag,
 }
 
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
-        self.scenes.check_output(&self.output)?;
+        self.scenes
+            .check_output(&self.output, self.overwrite.overwrite)?;
         let mut page = ReportPage::default();
         let report = self.scenes.score(
             |images, scenes| Ok(images.encode(scenes)?),

@@ -83,7 +83,7 @@ impl Scenes {
     ///
     /// # Errors
     /// An output that is an input or cannot be written; no data set.
-    pub fn check_output(&self, path: &Path) -> anyhow::Result<()> {
+    pub fn check_output(&self, path: &Path, overwrite: bool) -> anyhow::Result<()> {
         let mut outputs = Outputs::default();
         self.model.protect(&mut outputs);
         self.layout.protect(&mut outputs);
@@ -94,7 +94,7 @@ impl Scenes {
                 outputs.protect(&baseline.path(scene), &what);
             }
         }
-        Ok(outputs::check_output(outputs, path)?)
+        Ok(outputs::check_output(outputs, path, overwrite)?)
     }
 
     /// Scores every scene of the split in all metrics, with one scene in memory at a time.

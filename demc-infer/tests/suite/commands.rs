@@ -283,7 +283,7 @@ fn an_export_can_store_another_layout() {
     export(run.path(), &file, &["--layout", "cycles"]).success();
     let shown = demc_infer(arguments!["inspect", "--model", file]).success();
     shown.says("Combined.R");
-    export(run.path(), &file, &["--layout", "nonsense"])
+    export(run.path(), &file, &["--layout", "nonsense", "--overwrite"])
         .failure(2, "channel layout nonsense: neither");
 }
 

@@ -127,7 +127,7 @@ fn the_colour_has_the_same_bytes_with_layers_and_a_pattern_of_the_colour_adds_no
         tempfile::tempdir().expect("directory"),
     );
     let input = file_with_groups(dir.path());
-    let [plain, with, of_color] = ["a", "b", "c"].map(|name| dir.path().join(name));
+    let [plain, with, of_color] = ["a.exr", "b.exr", "c.exr"].map(|name| dir.path().join(name));
     denoise(run.path(), &input, &plain, &[]).success();
     denoise(run.path(), &input, &with, &["--layers", "*_rim.*"]).success();
     let flags = ["--layers", "ViewLayer.Combined.[RGB]"];
@@ -135,8 +135,7 @@ fn the_colour_has_the_same_bytes_with_layers_and_a_pattern_of_the_colour_adds_no
     assert_eq!(read(&plain, "Combined"), read(&with, "Combined"));
     let rim = ["B", "G", "R"].map(|c| format!("ViewLayer.Combined_rim.{c}"));
     assert_eq!(changed(&plain, &with), rim);
-    let [plain, of_color] = [plain, of_color].map(|path| fs::read(path).expect("a file"));
-    assert_eq!(plain, of_color);
+    assert_eq!(changed(&plain, &of_color), [""; 0]);
 }
 
 /// A file of several parts, with alpha beside the colour and depth in a part of its own.

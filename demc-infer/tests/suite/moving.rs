@@ -163,7 +163,8 @@ fn weights_without_a_header_need_a_model() {
     weights.truncate(3);
     let bytes = demc_infer::bundle::tensors::to_bytes(&weights).expect("bytes");
     fs::write(&bare, bytes).expect("written");
-    let list = arguments!["import", bare, "--like", run.path(), "-o", output];
+    let again = run.path().join("y.safetensors");
+    let list = arguments!["import", bare, "--like", run.path(), "-o", again];
     let start = format!("{}: missing: ", bare.display());
     demc_infer(list).failure(1, &start);
 }

@@ -9,6 +9,7 @@ use crate::run::data::{TrainingData, protect_inputs};
 use crate::tools::chart::with_extension;
 use crate::tools::find_lr::{RateRange, sweep};
 use clap::Args;
+use demc_program::cli::OverwriteFlag;
 use demc_program::exit::UsageError;
 use demc_program::message::printable;
 use demc_program::output::{Directories, Outputs};
@@ -41,9 +42,13 @@ pub struct Arguments {
     #[arg(long, value_name = "N", default_value_t = 300)]
     steps: usize,
 
-    /// Output files without extension (default: runs/find-lr/ and the configuration's name)
-    #[arg(short, long, value_name = "STEM")]
+    /// Output files, with or without .svg (default: runs/find-lr/ and the configuration's name, whose files are
+    /// replaced)
+    #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
+
+    #[command(flatten)]
+    overwrite: OverwriteFlag,
 
     #[command(flatten)]
     compute: ComputeArguments,
@@ -70,14 +75,12 @@ pub fn run(arguments: Arguments, reduce: &Reduce) -> anyhow::Result<u8> {
         && stem.file_name().is_none()
     {
         let stem = stem.display();
-        return Err(UsageError(format!(
-            "--out {stem}: expected a file name without extension"
-        ))
-        .into());
+        return Err(UsageError(format!("--out {stem}: expected a file name")).into());
     }
     let config = Config::load(&arguments.config, &arguments.set);
     let config = reduce.agree(config.map_err(Into::into))?;
     let name = arguments.config.file_stem().unwrap_or_default();
+    let replaces = arguments.overwrite.overwrite || arguments.out.is_none();
     let stem = arguments
         .out
         .unwrap_or_else(|| Path::new("runs/find-lr").join(name));
@@ -88,7 +91,7 @@ pub fn run(arguments: Arguments, reduce: &Reduce) -> anyhow::Result<u8> {
         let file = std::slice::from_ref(&arguments.config);
         protect_inputs(&mut outputs, file, &config)?;
         for extension in ["csv", "svg"] {
-            outputs.claim(&with_extension(&stem, extension)?, true)?;
+            outputs.claim(&with_extension(&stem, extension)?, replaces)?;
         }
         outputs.prepare(Directories::Create)?;
         TrainingData::open(&config)

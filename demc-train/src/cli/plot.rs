@@ -7,6 +7,7 @@ use crate::tools::chart::with_extension;
 use crate::tools::plot::{PlotOptions, plot};
 use clap::Args;
 use demc_infer::bundle::locate;
+use demc_program::cli::OverwriteFlag;
 use demc_program::message::printable;
 use demc_program::output::{Directories, Outputs};
 
@@ -20,9 +21,12 @@ pub struct Arguments {
     #[arg(required = true, value_name = "RUN")]
     runs: Vec<PathBuf>,
 
-    /// Output file without extension (default: curves in the first run)
-    #[arg(short, long, value_name = "STEM")]
+    /// Output file, with or without .svg (default: curves.svg in the first run, which is replaced)
+    #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
+
+    #[command(flatten)]
+    overwrite: OverwriteFlag,
 
     /// Smoothing of the training loss: weight of earlier values, 0 to below 1
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.9)]
@@ -38,15 +42,17 @@ pub fn run(arguments: Arguments) -> anyhow::Result<u8> {
     let Arguments {
         runs,
         out,
+        overwrite,
         smooth,
         linear,
     } = arguments;
+    let replaces = overwrite.overwrite || out.is_none();
     let stem = out.unwrap_or_else(|| runs[0].join("curves"));
     let mut outputs = Outputs::default();
     for file in runs.iter().flat_map(|run| locate::files(run)) {
         outputs.protect(&file, "a file of a run");
     }
-    outputs.claim(&with_extension(&stem, "svg")?, true)?;
+    outputs.claim(&with_extension(&stem, "svg")?, replaces)?;
     outputs.prepare(Directories::Expect)?;
     let drawn = plot(&runs, &stem, &PlotOptions { smooth, linear })?;
     for note in drawn.notes {

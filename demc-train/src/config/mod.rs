@@ -18,6 +18,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use demc_data::DataConfig;
+use demc_infer::Bundled;
 use demc_model::kernel_head::GAMMA;
 use demc_model::{Head, LossConfig, ModelConfig, Variant};
 use demc_program::file::{MAX_CONFIGURATION, read_text};
@@ -163,6 +164,7 @@ impl Config {
         for path in [&mut self.run.dir, &mut self.train.init]
             .into_iter()
             .flatten()
+            .filter(|path| Bundled::named(path).is_none())
         {
             *path = std::path::absolute(&*path)?;
         }

@@ -294,5 +294,25 @@ pub(super) fn blame(problems: Vec<String>, sets: &[String]) -> (Vec<String>, Vec
 }
 
 pub(crate) fn one_line(message: &str) -> String {
-    message.split_whitespace().collect::<Vec<_>>().join(" ")
+    let words: Vec<&str> = message.split_whitespace().collect();
+    match words[..] {
+        // The parser's words for types are those of the source code.
+        [ref before @ .., "expected", "struct", _] => {
+            format!("{} expected a table of keys", before.join(" "))
+        }
+        [ref before @ .., "expected", kind] => match plain_type(kind) {
+            Some(plain) => format!("{} expected {plain}", before.join(" ")),
+            None => words.join(" "),
+        },
+        _ => words.join(" "),
+    }
+}
+
+fn plain_type(kind: &str) -> Option<&'static str> {
+    match kind {
+        "u8" | "u32" | "u64" | "usize" => Some("a whole number from 0 up"),
+        "i64" => Some("an integer"),
+        "f32" | "f64" => Some("a number"),
+        _ => None,
+    }
 }

@@ -86,7 +86,7 @@ fn every_unknown_key_is_named_with_its_line_and_the_nearest_known_one() {
 fn wrong_types_name_line_and_expectation() {
     let error = parsed("[train]\nsteps = \"many\"\n", &[]).unwrap_err();
     assert!(
-        error.starts_with("run.toml:2: ") && error.contains("expected u64"),
+        error.starts_with("run.toml:2: ") && error.contains("expected a whole number from 0 up"),
         "{error}"
     );
 }

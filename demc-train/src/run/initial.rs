@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use anyhow::{Context, bail, ensure};
 use burn::tensor::Device;
 use demc_data::input::ranges::Ranges;
-use demc_infer::bundle::{Bundle, BundleFile};
+use demc_infer::bundle::{Bundle, BundleFile, Bundled};
 use demc_model::{Denoiser, ModelConfig};
-use demc_program::checksum::sha256_of;
+use demc_program::checksum::{sha256, sha256_of};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
@@ -83,9 +83,13 @@ pub fn initial_network(
             weights: None,
         });
     };
+    let bundled = config.train.init.as_deref().and_then(Bundled::named);
     let weights = InitialWeights {
         file: file.path.clone(),
-        sha256: sha256_of(&file.path)?,
+        sha256: match bundled {
+            Some(model) => sha256([model.bytes()]),
+            None => sha256_of(&file.path)?,
+        },
         step: file.meta.step,
         albedo_demodulation_epsilon: file.meta.normalizer.albedo_demodulation_epsilon,
         ranges: file.meta.ranges.clone(),

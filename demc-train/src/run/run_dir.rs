@@ -73,7 +73,7 @@ impl RunDir {
             let differences = config.differences(&saved);
             ensure!(
                 differences.is_empty(),
-                "{}: contains a run with another configuration: {}",
+                "{}: contains a run with another configuration: {}; undo the edit, or name another directory with --run-dir",
                 path.display(),
                 differences.join("; ")
             );

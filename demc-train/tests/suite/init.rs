@@ -162,6 +162,7 @@ fn the_albedo_filter_of_the_first_run_is_kept() {
         let sweep = Command::new(env!("CARGO_BIN_EXE_demc-train"))
             .args(["find-lr", "--steps", "10", "--set", init, "--config"])
             .args([&config, Path::new("--out"), &out])
+            .arg("--overwrite")
             .output();
         assert!(sweep.expect("it starts").status.success());
         fs::read(out.with_extension("csv")).expect("a table")

@@ -187,7 +187,7 @@ fn finished(config: &Config) -> anyhow::Result<Option<FinishedRun>> {
     let differences = config.differences(&saved);
     ensure!(
         differences.is_empty(),
-        "{}: contains a run with another configuration: {}",
+        "{}: contains a run with another configuration: {}; undo the edit, or name another directory with --run-dir",
         dir.display(),
         differences.join("; ")
     );

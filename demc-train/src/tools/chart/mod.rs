@@ -40,7 +40,7 @@ impl Figure {
     }
 }
 
-/// `STEM.EXTENSION`. Unlike `Path::with_extension`, it keeps a dot in the stem.
+/// `STEM.EXTENSION`. Unlike `Path::with_extension`, it keeps a dot in the stem, except that of `.svg`.
 ///
 /// # Errors
 /// A stem without a file name.
@@ -48,10 +48,13 @@ pub fn with_extension(stem: &Path, extension: &str) -> anyhow::Result<PathBuf> {
     let is_directory = stem.as_os_str().as_encoded_bytes().ends_with(b"/");
     ensure!(
         stem.file_name().is_some() && !is_directory,
-        "{}: expected a file name without extension",
+        "{}: expected a file name",
         stem.display()
     );
-    let mut path = OsString::from(stem);
+    let mut path = match stem.extension() {
+        Some(svg) if svg == "svg" => stem.with_extension("").into_os_string(),
+        _ => OsString::from(stem),
+    };
     path.push(".");
     path.push(extension);
     Ok(path.into())
