@@ -27,11 +27,12 @@ class Output:
 
     file: where the command writes it. ending: what the program adds to the path that it gets. fixed: the program
     chooses the file's name. overwrite: an existing file needs --overwrite. directory: the program creates its
-    directory. command: from the path without ending to arguments.
+    directory. suffix: how the name must end. command: from the path without ending to arguments.
     """
 
-    def __init__(self, name, file, command, inputs, ending="", fixed=False, overwrite=False, directory=False):
+    def __init__(self, name, file, command, inputs, ending="", fixed=False, overwrite=False, directory=False, suffix=None):
         self.name, self.file, self.command, self.inputs = name, file, command, inputs
+        self.suffix = suffix or ending
         self.ending, self.fixed, self.overwrite, self.directory = ending, fixed, overwrite, directory
 
     def arguments(self, path=None):
@@ -51,33 +52,37 @@ def outputs(project):
     trained = scenes + ["tiny.toml"]
     return [
         Output("denoise", "out.exr", lambda o: [*denoise, "-o", o], ["frame.exr", "layout.toml", *MODEL],
-               overwrite=True),
+               overwrite=True, directory=True, suffix=".exr"),
         Output("denoise --png", "out.png", lambda o: [*denoise, "--png", "-o", joined(o, ".exr")],
-               ["frame.exr", "layout.toml", *MODEL], ending=".png", overwrite=True),
+               ["frame.exr", "layout.toml", *MODEL], ending=".png", overwrite=True,
+               directory=True),
         Output("denoise, run", "out.exr", lambda o: ["demc-infer", "denoise", "frame.exr", "--model", "run", "-o", o],
-               RUN, overwrite=True),
-        Output("evaluate", "scores.json", lambda o: ["demc-infer", "evaluate", *scoring, "--json", o], scored),
-        Output("report", "report.html", lambda o: ["demc-infer", "report", *scoring, "-o", o], scored),
+               RUN, overwrite=True, directory=True, suffix=".exr"),
+        Output("evaluate", "scores.json", lambda o: ["demc-infer", "evaluate", *scoring, "--json", o], scored,
+               overwrite=True),
+        Output("report", "report.html", lambda o: ["demc-infer", "report", *scoring, "-o", o], scored, overwrite=True),
         Output("report, run", "report.html", lambda o: ["demc-infer", "report", "--data", "data", "--model", "run",
-                                                        "-o", o], RUN),
+                                                        "-o", o], RUN, overwrite=True),
         Output("export", "new.safetensors",
                lambda o: ["demc-infer", "export", "--model", "model.safetensors", "--layout", "layout.toml", "-o", o],
-               ["layout.toml", *MODEL]),
+               ["layout.toml", *MODEL], overwrite=True),
         Output("export, run", "new.onnx",
-               lambda o: ["demc-infer", "export", "--format", "onnx", "--model", "run", "-o", o], RUN),
+               lambda o: ["demc-infer", "export", "--format", "onnx", "--model", "run", "-o", o], RUN,
+               overwrite=True),
         Output("import", "back.safetensors",
                lambda o: ["demc-infer", "import", "tuned.safetensors", "--like", "run", "-o", o],
-               ["tuned.safetensors", *RUN]),
+               ["tuned.safetensors", *RUN], overwrite=True),
         Output("merge", "merged.exr", lambda o: ["demc-data", "merge", "x=frame.exr", "bare/scene.exr", "-o", o],
                ["frame.exr", "bare/scene.exr"], overwrite=True),
         Output("index", "bare/manifest.json",
                lambda o: ["demc-data", "index", o or ".", "--layout", "bare/layout.toml"],
                ["bare/scene.exr", "bare/layout.toml"], fixed=True, overwrite=True),
         Output("find-lr, csv", "sweep.csv", lambda o: ["demc-train", "find-lr", *tiny, "--steps", "10", "-o", o],
-               trained, ending=".csv", directory=True),
+               trained, ending=".csv", directory=True, overwrite=True),
         Output("find-lr, svg", "sweep.svg", lambda o: ["demc-train", "find-lr", *tiny, "--steps", "10", "-o", o],
-               trained, ending=".svg", directory=True),
-        Output("plot", "curves.svg", lambda o: ["demc-train", "plot", "run", "-o", o], RUN, ending=".svg"),
+               trained, ending=".svg", directory=True, overwrite=True),
+        Output("plot", "curves.svg", lambda o: ["demc-train", "plot", "run", "-o", o], RUN, ending=".svg",
+               overwrite=True),
         *(Output(f"ablate, {kind}", f"ablation/ablation.{kind}",
                  lambda o: ["demc-train", "ablate", "--config", "ablation.toml", "--run-dir", o or "."],
                  [*trained, "ablation.toml"], fixed=True, directory=True) for kind in ("md", "csv", "json")),

@@ -37,7 +37,7 @@ class Checksums(Attack):
         rng = random.Random(4)
         kinds = [(names, precision) for names in ("burn", "torch") for precision in ("f32", "f16")]
         for names, precision in kinds:
-            result = self.run_program("demc-infer", "export", "--model", "run", "-o", "e.safetensors",
+            result = self.run_program("demc-infer", "export", "--model", "run", "-o", "e.safetensors", "--overwrite",
                                       "--names", names, "--precision", precision)
             self.assertEqual(result.code, 0, result)
             whole = (self.root / "e.safetensors").read_bytes()

@@ -102,8 +102,8 @@ class Limits(Attack):
             (0, infer, "cost", "frame.exr"),
             (0, infer, "inspect"),
             (0, infer, "evaluate", "--data", "data"),
-            (0, infer, "report", "--data", "data", "-o", "report.html"),
-            (0, infer, "export", "-o", "exported.safetensors"),
+            (0, infer, "report", "--data", "data", "-o", "report.html", "--overwrite"),
+            (0, infer, "export", "-o", "exported.safetensors", "--overwrite"),
             (0, data, "inspect", "frame.exr"),
             (1, data, "inspect", "bad.exr", "frame.exr"),
             (0, data, "stats", "data"),
@@ -165,8 +165,8 @@ class Limits(Attack):
             os.close(pipe), os.close(full)
 
     def test_08_a_status_may_be_lost(self):
-        for command in (["demc-infer", "export", "-o", "e.safetensors"],
-                        ["demc-infer", "report", "--data", "data", "-o", "r.html"],
+        for command in (["demc-infer", "export", "-o", "e.safetensors", "--overwrite"],
+                        ["demc-infer", "report", "--data", "data", "-o", "r.html", "--overwrite"],
                         ["demc-data", "merge", "frame.exr", "-o", "m.exr"], ["demc-train", "plot", "run"]):
             full = os.open("/dev/full", os.O_WRONLY)
             result = self.run_program(*command, stdout=full)

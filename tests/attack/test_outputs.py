@@ -63,7 +63,7 @@ class Outputs(Attack):
         }
         for output in self.outputs:
             for number, source in enumerate(output.inputs):
-                any_name = not output.fixed and source.endswith(output.ending)
+                any_name = not output.fixed and source.endswith(output.suffix)
                 kinds = list(aliases) if any_name else ["symlink", "hard link"]
                 for kind in kinds if common.LONG else [kinds[number % len(kinds)]]:
                     with self.subTest(output=output.name, input=source, alias=kind):
@@ -102,13 +102,13 @@ class Outputs(Attack):
             with self.subTest(output=output.name):
                 path = self.root / output.file
                 path.write_bytes(b"mine")
-                self.one_line(self.run_output(output), 2, path.name, "exists; --overwrite replaces it")
+                self.one_line(self.run_output(output), 2, path.name, "exists", "--overwrite replaces it")
                 self.assertEqual(path.read_bytes(), b"mine")
                 if output.name != "index":
                     result = self.run_output(output, None, "--overwrite")
                     self.assertEqual(result.code, 0, result)
                     self.assertNotEqual(path.read_bytes(), b"mine")
-                for made in self.root.glob("out.*"):
+                for made in self.root.glob(f"{path.stem}.*"):
                     made.unlink()
 
     def test_02_previews(self):
@@ -118,22 +118,23 @@ class Outputs(Attack):
         before = outputs.contents(self.root)
         self.one_line(self.run_program(*denoise, "pin.png", "-o", "pin.exr"), 2, "pin.png would replace the input")
         (self.root / "pc.png").unlink()
-        self.one_line(self.run_program(*denoise, "frame.exr", "-o", "pc.png"), 2, "pc.png would be written twice")
+        self.one_line(self.run_program(*denoise, "frame.exr", "-o", "pc.png"), 2, "an output is an EXR file")
         self.one_line(self.run_program(*denoise, "frame.exr", "pin.png", "-o", "pin.png", "--overwrite"), 2)
         self.assertEqual(outputs.contents(self.root), {p: b for p, b in before.items() if p.name != "pc.png"})
-        # In a directory, what exists is kept and what lacks is made.
+        # In a directory, what another program made is kept, and reported.
         out = self.root / "out"
         out.mkdir()
         (out / "frame.png").write_bytes(b"mine")
         result = self.run_program(*denoise, "frame.exr", "-o", "out")
-        self.assertEqual(result.code, 0, result)
-        self.assertIn("existing previews are kept: 1; --overwrite replaces them", result.stderr)
+        self.assert_refused(result, "frame.png exists, not written by this program; --overwrite replaces it")
         self.assertEqual((out / "frame.png").read_bytes(), b"mine")
+        self.assertTrue((out / "frame.exr").is_file())
         (out / "frame.png").unlink()
         (out / "frame.exr").write_bytes(b"mine")
-        self.assertEqual(self.run_program(*denoise, "frame.exr", "-o", "out").code, 0)
+        result = self.run_program(*denoise, "frame.exr", "-o", "out")
+        self.assert_refused(result, "frame.exr exists, damaged, or not an EXR file; --overwrite replaces it")
         self.assertEqual((out / "frame.exr").read_bytes(), b"mine")
-        self.assertTrue((out / "frame.png").read_bytes().startswith(b"\x89PNG"))
+        self.assertFalse((out / "frame.png").exists())
 
     def test_03_outputs_keep_their_bytes(self):
         for output in self.one_of_each():
@@ -256,13 +257,13 @@ class Outputs(Attack):
         for number, output in enumerate(self.outputs):
             if output.name.startswith(("train", "index")):
                 continue
-            ending, name = output.ending, os.path.basename(output.file)
+            ending, name = output.suffix, os.path.basename(output.file)
             places = {"a file as directory": f"file/{name}"}
             if not output.directory:
                 places["no directory"] = f"missing/{name}"
             if not output.fixed:
-                places["a directory"] = f"taken{ending}"
-                (self.root / f"taken{ending}").mkdir(exist_ok=True)
+                places["a directory"] = f"taken{number}{ending}"
+                (self.root / f"taken{number}{ending}").mkdir()
                 places["a long name"] = f"{'n' * 250}{ending}"
                 places["a link to nothing"] = f"dangling{ending}"
                 dangling = self.root / f"dangling{ending}"
@@ -275,7 +276,7 @@ class Outputs(Attack):
             for order, (problem, path) in enumerate(places.items()):
                 if (number + order) % 2 and not common.LONG:
                     continue  # The short form tries every problem with every other output.
-                if problem == "a directory" and output.name.startswith("denoise") and not ending:
+                if problem == "a directory" and output.name.startswith("denoise") and not output.ending:
                     continue  # It gets the image.
                 with self.subTest(output=output.name, problem=problem):
                     options = {}

@@ -232,7 +232,7 @@ impl Jobs {
     /// command asks for.
     ///
     /// # Errors
-    /// The only output is such a file.
+    /// The output that is not in a directory, or its preview, is such a file.
     pub fn report_skipped(&self) -> Result<usize, UsageError> {
         if self.skipped > 0 {
             let (done, all) = (self.skipped, self.count);
@@ -246,7 +246,7 @@ impl Jobs {
                 more => format!(" (and {more} more)"),
             };
             let line = format!("{}{more} exists, {why}; --overwrite replaces it", files[0]);
-            if !self.directory && self.list.is_empty() {
+            if !self.directory {
                 return Err(UsageError(line));
             }
             message::say(format_args!("error: {line}"));

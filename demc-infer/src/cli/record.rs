@@ -31,9 +31,21 @@ impl Record {
         self.0.insert(flag.to_owned(), value.to_string());
     }
 
-    /// The text for the header.
+    /// The text for the header, in ASCII: JSON escapes other characters of paths.
     pub fn text(&self) -> String {
-        serde_json::to_string(self).expect("a map of strings")
+        let text = serde_json::to_string(self).expect("a map of strings");
+        let mut ascii = String::with_capacity(text.len());
+        for character in text.chars() {
+            if character.is_ascii() {
+                ascii.push(character);
+            } else {
+                let mut units = [0; 2];
+                for unit in character.encode_utf16(&mut units) {
+                    ascii += &format!("\\u{unit:04x}");
+                }
+            }
+        }
+        ascii
     }
 
     /// The record of a header; `None` if the text is no record.
@@ -94,7 +106,11 @@ mod tests {
             quality.differences(&trained),
             "other weights of --model quality"
         );
-        assert_eq!(Record::parse(&layers.text()), Some(layers));
+        let named = Record::of_model("modèle \u{1f600}", "4d");
+        assert!(named.text().is_ascii());
+        for record in [layers, named] {
+            assert_eq!(Record::parse(&record.text()), Some(record));
+        }
         assert_eq!(Record::parse("painted by hand"), None);
     }
 }
