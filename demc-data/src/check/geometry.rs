@@ -25,6 +25,12 @@ const LOWEST: f32 = -0.05;
 /// Smallest median cosine between the normals and the surface that the positions describe
 /// (classroom: 0.977).
 const ALIGNED: f32 = 0.8;
+/// Cosine between a normal and that surface below which it is far from it.
+const STEEP: f32 = 0.5;
+/// Share of such normals above which axes may be exchanged (renders: 0.24), and the share of that which must
+/// remain with the axes in another order (renders: 1).
+const MOST_STEEP: f32 = 0.1;
+const FEWER: f32 = 0.5;
 /// Share of normals that face the origin above which the origin may be the camera (staircase:
 /// 0.995).
 const FACING: f32 = 0.9995;
@@ -126,7 +132,7 @@ impl<'a> SurfacePixels<'a> {
                 "is it another buffer (swapped with albedo?), or not normalised?",
             );
         }
-        let cosine = self.median(|i| self.cosine(i));
+        let cosine = self.median(|i| self.cosine(i, [0, 1, 2]));
         if cosine < ALIGNED {
             return warning(
                 format!(
@@ -134,6 +140,22 @@ impl<'a> SurfacePixels<'a> {
                 ),
                 "are normals in camera space and positions in world space, or axes swapped?",
             );
+        }
+        let steep = self.share(|i| self.cosine(i, [0, 1, 2]) < STEEP);
+        if steep > MOST_STEEP {
+            let others = [[1, 0, 2], [0, 2, 1], [2, 1, 0], [1, 2, 0], [2, 0, 1]];
+            let shares = others.map(|axes| self.share(|i| self.cosine(i, axes) < STEEP));
+            let best = shares.into_iter().fold(1.0, f32::min);
+            if best < FEWER * steep {
+                let [found, best] = [steep, best].map(|share| 100.0 * share);
+                return warning(
+                    format!(
+                        "it is far from the surface that the positions describe at {found:.0} % of the pixels, with \
+                         exchanged axes at {best:.0} %"
+                    ),
+                    "are its axes exchanged, or those of the position?",
+                );
+            }
         }
         let facing = self.share(|i| {
             dot(
@@ -188,8 +210,9 @@ impl<'a> SurfacePixels<'a> {
         })
     }
 
-    /// Absolute cosine between the normal and the surface through the neighbours' positions.
-    fn cosine(&self, i: usize) -> f32 {
+    /// Absolute cosine between the normal, with its axes in this order, and the surface through the
+    /// neighbours' positions.
+    fn cosine(&self, i: usize, axes: [usize; 3]) -> f32 {
         let position = |i| vector(self.frame, POSITIONS, i);
         let across = difference(position(i + 1), position(i - 1));
         let down = difference(
@@ -197,7 +220,8 @@ impl<'a> SurfacePixels<'a> {
             position(i - self.frame.width),
         );
         let surface = cross(across, down);
-        let normal = vector(self.frame, NORMAL, i);
+        let named = vector(self.frame, NORMAL, i);
+        let normal = axes.map(|axis| named[axis]);
         // A constant position buffer describes no surface.
         match norm(surface) * norm(normal) {
             0.0 => 1.0,

@@ -336,3 +336,228 @@ fn unusable_files_are_found() {
         (expected, 10)
     );
 }
+
+/// Six scenes of the sample, each with 31 mistakes.
+const SCENES: [&str; 6] = [
+    "col-ashtray-0",
+    "col-bathroom-0",
+    "col-staircase-0",
+    "gen-room-train-0",
+    "gen-table-train-1",
+    "gen-table-train-8",
+];
+
+fn moved(planes: &mut Planes, names: &[&str], place: impl Fn(usize, usize) -> (usize, usize)) {
+    for name in names {
+        let before = planes[*name].clone();
+        let from = |i: usize| {
+            let (x, y) = place(i % SIDE, i / SIDE);
+            before[y.min(SIDE - 1) * SIDE + x.min(SIDE - 1)]
+        };
+        planes.insert((*name).to_owned(), (0..PIXELS).map(from).collect());
+    }
+}
+
+fn srgb(x: f32) -> f32 {
+    if x <= 0.003_130_8 {
+        12.92 * x
+    } else {
+        1.055 * x.powf(1.0 / 2.4) - 0.055
+    }
+}
+
+type Fault = (&'static str, fn(&mut Planes, &Planes));
+
+const FEATURES: [&str; 12] = [
+    "normal.X",
+    "normal.Y",
+    "normal.Z",
+    "position.X",
+    "position.Y",
+    "position.Z",
+    "albedo1.R",
+    "albedo1.G",
+    "albedo1.B",
+    "albedo2.R",
+    "albedo2.G",
+    "albedo2.B",
+];
+const ALBEDO2: [&str; 3] = ["albedo2.R", "albedo2.G", "albedo2.B"];
+
+/// Mistakes within a scene; the second argument is another scene.
+const FAULTS: [Fault; 29] = [
+    ("features of another scene", |planes, other| {
+        for name in FEATURES {
+            planes.insert(name.to_owned(), other[name].clone());
+        }
+    }),
+    ("features shifted by 4", |planes, _| {
+        moved(planes, &FEATURES, |x, y| (x + 4, y))
+    }),
+    ("features mirrored", |planes, _| {
+        moved(planes, &FEATURES, |x, y| (SIDE - 1 - x, y))
+    }),
+    ("red and blue of the reference exchanged", |planes, _| {
+        swap(planes, ["ref.R"; 3], ["ref.B"; 3])
+    }),
+    ("reference shifted by 4", |planes, _| {
+        moved(planes, &REFERENCE, |x, y| (x.saturating_sub(4), y))
+    }),
+    ("albedos exchanged", |planes, _| {
+        swap(planes, ALBEDO, ALBEDO2)
+    }),
+    ("both images in sRGB", |planes, _| {
+        each(planes, COLOR, srgb);
+        each(planes, REFERENCE, srgb);
+    }),
+    ("reference half mixed with the noisy image", |planes, _| {
+        for (name, noisy) in REFERENCE.into_iter().zip(COLOR) {
+            let pairs = planes[name].iter().zip(&planes[noisy]);
+            let mixed = pairs.map(|(a, b)| 0.5 * (a + b)).collect();
+            planes.insert(name.to_owned(), mixed);
+        }
+    }),
+    ("x and y of the normal exchanged", |planes, _| {
+        swap(planes, ["normal.X"; 3], ["normal.Y"; 3])
+    }),
+    ("y and z of the normal exchanged", |planes, _| {
+        swap(planes, ["normal.Y"; 3], ["normal.Z"; 3])
+    }),
+    ("noisy image clamped", |planes, _| {
+        each(planes, COLOR, |x| x.min(1.0))
+    }),
+    ("albedo is the colour", |planes, _| {
+        copy(planes, COLOR, ALBEDO)
+    }),
+    ("reference shifted by 1", |planes, _| {
+        moved(planes, &REFERENCE, |x, y| (x, y + 1))
+    }),
+    ("reference of another scene", |planes, other| {
+        for name in REFERENCE {
+            planes.insert(name.to_owned(), other[name].clone());
+        }
+    }),
+    ("reference is the noisy image", |planes, _| {
+        copy(planes, COLOR, REFERENCE)
+    }),
+    ("reference and noisy image exchanged", |planes, _| {
+        swap(planes, COLOR, REFERENCE)
+    }),
+    ("reference black", |planes, _| {
+        each(planes, REFERENCE, |_| 0.0)
+    }),
+    ("noisy image black", |planes, _| {
+        each(planes, COLOR, |_| 0.0)
+    }),
+    ("reference brighter", |planes, _| {
+        each(planes, REFERENCE, |x| 2.0 * x)
+    }),
+    ("reference darker", |planes, _| {
+        each(planes, REFERENCE, |x| 0.6 * x)
+    }),
+    ("NaN in the reference", |planes, _| {
+        planes.get_mut("ref.G").expect("green")[77] = f32::NAN
+    }),
+    ("negative radiance", |planes, _| {
+        for name in COLOR {
+            let plane = planes.get_mut(name).expect("a channel");
+            plane.iter_mut().step_by(12).for_each(|x| *x = -0.01);
+        }
+    }),
+    ("a wide pixel filter", |planes, _| {
+        for name in COLOR {
+            let plane = filtered(&planes[name], 0.14);
+            planes.insert(name.to_owned(), plane);
+        }
+    }),
+    ("albedo constant", |planes, _| each(planes, ALBEDO, |_| 0.5)),
+    ("normals packed", |planes, _| {
+        each(planes, NORMAL, |x| x / 2.0 + 0.5)
+    }),
+    ("normals in camera space", |planes, _| {
+        let [y, z] = ["normal.Y", "normal.Z"].map(|name| planes[name].clone());
+        let turned = |sign: f32, scale: f32| {
+            let pairs = y.iter().zip(&z);
+            pairs.map(|(y, z)| (y + sign * z) * scale).collect()
+        };
+        let half = 0.5f32.sqrt();
+        planes.insert("normal.Y".to_owned(), turned(1.0, half));
+        planes.insert("normal.Z".to_owned(), turned(-1.0, -half));
+    }),
+    ("normals too long", |planes, _| {
+        each(planes, NORMAL, |x| 3.0 * x)
+    }),
+    ("normal and albedo exchanged", |planes, _| {
+        swap(planes, NORMAL, ALBEDO)
+    }),
+    ("normal and position exchanged", |planes, _| {
+        swap(planes, NORMAL, POSITION)
+    }),
+];
+
+/// Of 186 mistakes, at least 165 are found.
+#[test]
+fn planted_mistakes_are_found() {
+    let scenes: BTreeMap<&str, Planes> = SCENES
+        .into_iter()
+        .map(|name| (name, planes(name)))
+        .collect();
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let mut entries = Vec::new();
+    for (number, (fault, damage)) in FAULTS.iter().enumerate() {
+        for (index, name) in SCENES.iter().enumerate() {
+            let mut planes = scenes[name].clone();
+            damage(&mut planes, &scenes[SCENES[(index + 1) % SCENES.len()]]);
+            let file = format!("{number}-{name}");
+            save(&dir.path().join(format!("{file}.exr")), planes);
+            let mut entry = entry(&file, "train");
+            entry["base"] = format!("{fault}, {name}").into();
+            entries.push(entry);
+        }
+    }
+    let manifest = json!({"format": "demc-exr 1", "scenes": entries});
+    fs::write(dir.path().join("manifest.json"), manifest.to_string()).expect("writable");
+    let report = examine(dir.path(), None, 128).expect("a data set");
+    let affected = report.problems.iter().flat_map(|problem| &problem.scenes);
+    let with_problem: std::collections::BTreeSet<&str> =
+        affected.map(|affected| affected.scene.as_str()).collect();
+    let mut found = 0;
+    for (number, (fault, _)) in FAULTS.iter().enumerate() {
+        let of_fault = SCENES.iter().filter(|name| {
+            let file = format!("{number}-{name}");
+            with_problem.contains(file.as_str())
+        });
+        let count = of_fault.count();
+        println!("{count} of 6: {fault}");
+        found += count;
+    }
+    // A view in the other split, mirrored or cropped.
+    for (fault, place) in [
+        (
+            "mirrored view",
+            (|x, y| (SIDE - 1 - x, y)) as fn(usize, usize) -> (usize, usize),
+        ),
+        ("crop", |x, y| (x / 2 + 50, y / 2 + 50)),
+    ] {
+        let mut count = 0;
+        for name in SCENES {
+            let mut set = Set::new();
+            save(&set.path("bad.exr"), scenes[name].clone());
+            let mut copy = scenes[name].clone();
+            let names: Vec<String> = copy.keys().cloned().collect();
+            let names: Vec<&str> = names.iter().map(String::as_str).collect();
+            moved(&mut copy, &names, place);
+            save(&set.path("copy.exr"), copy);
+            set.scenes.push(entry("copy", "test"));
+            let problems = set.examine().problems;
+            let both = problems
+                .iter()
+                .filter(|problem| problem.problem.contains("both splits"));
+            count += usize::from(both.count() > 0);
+        }
+        println!("{count} of 6: {fault}");
+        found += count;
+    }
+    println!("{found} of 186");
+    assert!(found >= 165, "{found}");
+}

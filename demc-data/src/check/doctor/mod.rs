@@ -4,6 +4,8 @@
 //! compares noisy image and reference, `set` compares scenes with each other. All limits were set on
 //! the 108 scenes of the training and test renders, none of which has a finding.
 
+mod alignment;
+mod details;
 mod finding;
 mod reference;
 mod scene;

@@ -3,8 +3,8 @@
 //! The numbers at the limits are those of the 108 training and test renders at 4 samples per pixel,
 //! with references of 64 to 1984.
 
+use super::details::{Details, mean, shifts};
 use super::finding::Finding;
-use crate::check::noise::log_luminance;
 use crate::image::frame::Frame;
 use crate::input::ranges::{LUMINANCE, exposure};
 
@@ -17,8 +17,6 @@ const MIN_BLOCKS: usize = 16;
 const SAME_VIEW: f64 = 0.92;
 /// Largest difference of the exposures in stops (renders: 0.05).
 const MAX_STOPS: f64 = 0.3;
-/// Farthest shift that is tried, in pixels.
-const FARTHEST: usize = 2;
 /// Standard errors by which the correlation of a shifted reference must be larger.
 const MIN_ERRORS: f64 = 4.0;
 /// Largest noise variance of the reference, as a share of the noisy image's (renders: 0.19).
@@ -29,6 +27,24 @@ const MIN_NOISE: f64 = 1e-4;
 const BLACK: f64 = 1e-3;
 /// Luminance that is added before a logarithm, in exposures.
 const DARK: f64 = 0.05;
+/// Smallest mean square of the difference of hues that counts.
+const MIN_HUE: f64 = 1e-3;
+/// Share of that difference to which another order of the channels must reduce it (renders: no order reduces it;
+/// exchanged: 0.015).
+const OTHER_ORDER: f64 = 0.2;
+/// Smallest number and share of samples at the largest value of a clamped image (renders: one).
+const MIN_CUT: usize = 50;
+const CUT_SHARE: f64 = 2e-4;
+/// Largest relative difference of such a sample from the reference where a lamp is seen.
+const LAMP: f32 = 0.1;
+/// Smallest difference of noisy image and reference that shows encoded values: of the logarithms of blocks'
+/// means (renders: 0.009).
+const DARKER: f64 = 0.02;
+/// Largest share of it that remains after decoding.
+const CLOSER: f64 = 0.6;
+/// Slope of the reference's details on the difference from the noisy image that shows common noise (renders:
+/// 0.004; a mean of both: 1).
+const SHARED: f64 = 0.2;
 /// Smallest mean of a block that tells the exposure, in exposures of the reference.
 const BRIGHT: f64 = 0.1;
 
@@ -62,22 +78,172 @@ fn mistake(frame: &Frame, reference: &[f32], filtered: bool) -> Option<Mistake> 
     if means[0].len() < MIN_BLOCKS {
         return None;
     }
-    another_view(&means)
+    exchanged(frame, reference)
+        .or_else(|| another_view(&means))
         .or_else(|| other_exposure(&means))
+        .or_else(|| clamped(frame, reference))
+        .or_else(|| encoded(frame, reference))
         .or_else(|| {
             let images = [&frame.color[..], reference];
             let [noisy, clean] = images.map(|image| Details::of(image, frame));
             let (noisy, clean) = (noisy?, clean?);
-            shifted(&noisy, &clean).or_else(|| noise(&noisy, &clean).filter(|_| !filtered))
+            shifted(&noisy, &clean)
+                .or_else(|| mixed(frame, reference))
+                .or_else(|| noise(&noisy, &clean).filter(|_| !filtered))
         })
+}
+
+/// A reference whose channels are in another order: then its blocks have another hue.
+fn exchanged(frame: &Frame, reference: &[f32]) -> Option<Mistake> {
+    const ORDERS: [([usize; 3], &str); 6] = [
+        ([0, 1, 2], "RGB"),
+        ([0, 2, 1], "RBG"),
+        ([1, 0, 2], "GRB"),
+        ([1, 2, 0], "GBR"),
+        ([2, 0, 1], "BRG"),
+        ([2, 1, 0], "BGR"),
+    ];
+    let hues = [&frame.color[..], reference].map(|image| {
+        let channels = image.chunks_exact(frame.width * frame.height);
+        let dark = DARK * exposure(image);
+        let logs: Vec<Vec<f64>> = channels
+            .map(|channel| {
+                let means = block_means_of(&[channel], &[1.0], frame);
+                means.iter().map(|mean| (mean + dark).ln()).collect()
+            })
+            .collect();
+        let grey = |block: usize| (logs[0][block] + logs[1][block] + logs[2][block]) / 3.0;
+        logs.iter()
+            .map(|log| {
+                (0..log.len())
+                    .map(|block| log[block] - grey(block))
+                    .collect()
+            })
+            .collect::<Vec<Vec<f64>>>()
+    });
+    let [noisy, clean] = &hues;
+    let difference = |order: [usize; 3]| -> f64 {
+        let channels = order.into_iter().enumerate();
+        let squares = channels.flat_map(|(c, from)| {
+            let pairs = noisy[c].iter().zip(&clean[from]);
+            pairs.map(|(a, b)| (a - b).powi(2))
+        });
+        mean(squares)
+    };
+    let as_named = difference(ORDERS[0].0);
+    let others = ORDERS[1..]
+        .iter()
+        .map(|(order, name)| (difference(*order), *name));
+    let (best, order) = others.min_by(|a, b| a.0.total_cmp(&b.0))?;
+    (as_named > MIN_HUE && best < OTHER_ORDER * as_named).then(|| {
+        (
+            "the reference has its channels in another order",
+            "exchange them, or name them so in the layout",
+            format!("they fit as {order}"),
+        )
+    })
+}
+
+/// A noisy image that was cut off at a value, which the reference exceeds. Where a lamp is seen, the reference
+/// has that value, too.
+fn clamped(frame: &Frame, reference: &[f32]) -> Option<Mistake> {
+    let largest = |image: &[f32]| image.iter().copied().fold(0.0, f32::max);
+    let most = largest(&frame.color);
+    let pairs = frame.color.iter().zip(reference);
+    let at_most = pairs.filter(|(noisy, _)| **noisy == most);
+    let cut = at_most.clone().count();
+    let differs = at_most.filter(|(_, clean)| (*clean - most).abs() > LAMP * most);
+    let is_cut = cut >= MIN_CUT && cut as f64 > CUT_SHARE * frame.color.len() as f64;
+    (is_cut && 2 * differs.count() > cut && largest(reference) > most).then(|| {
+        (
+            "the noisy image is clamped",
+            "switch off the clamping of the renderer: it removes light",
+            format!("{cut} samples are {most}, its largest value"),
+        )
+    })
+}
+
+/// Images that are encoded for a display. The mean of encoded noise is darker than the encoded mean.
+fn encoded(frame: &Frame, reference: &[f32]) -> Option<Mistake> {
+    let darker = |linear: bool| {
+        let [noisy, clean] = [&frame.color[..], reference].map(|image| {
+            if linear {
+                block_means(
+                    &image.iter().copied().map(linear_of).collect::<Vec<f32>>(),
+                    frame,
+                )
+            } else {
+                block_means(image, frame)
+            }
+        });
+        let dark = BRIGHT * mean(clean.iter().copied());
+        let pairs = noisy.iter().zip(&clean).filter(|(_, clean)| **clean > dark);
+        let mut ratios: Vec<f64> = pairs.map(|(noisy, clean)| (noisy / clean).ln()).collect();
+        ratios.sort_by(f64::total_cmp);
+        ratios.get(ratios.len() / 2).copied()
+    };
+    let as_is = darker(false)?;
+    let linear = darker(true)?;
+    (as_is < -DARKER && linear.abs() < CLOSER * as_is.abs()).then(|| {
+        (
+            "noise makes the noisy image darker than the reference",
+            "are both encoded for a display (sRGB)? Training needs linear radiance",
+            format!(
+                "by {:.1} %, and by {:.1} % after decoding sRGB",
+                100.0 * (1.0 - as_is.exp()),
+                100.0 * (1.0 - linear.exp())
+            ),
+        )
+    })
+}
+
+/// The inverse of the sRGB curve.
+fn linear_of(value: f32) -> f32 {
+    if value <= 0.04045 {
+        value / 12.92
+    } else {
+        ((value + 0.055) / 1.055).powf(2.4)
+    }
+}
+
+/// A reference that contains the noise of the noisy image: the difference of both then correlates with it.
+fn mixed(frame: &Frame, reference: &[f32]) -> Option<Mistake> {
+    let dark = DARK * exposure(reference);
+    let [noisy, clean] = [&frame.color[..], reference].map(|image| {
+        let pixels = frame.width * frame.height;
+        let log = (0..pixels).map(|i| {
+            let channels = LUMINANCE.iter().enumerate();
+            let luminance: f32 = channels
+                .map(|(c, weight)| weight * image[c * pixels + i])
+                .sum();
+            (f64::from(luminance) + dark).ln()
+        });
+        log.collect::<Vec<f64>>()
+    });
+    let difference: Vec<f64> = noisy.iter().zip(&clean).map(|(a, b)| a - b).collect();
+    let [noise, clean] = [&difference, &clean].map(|image| Details::without_mean(image, frame));
+    let variance = noise.variance();
+    let share = noise.covariance(&clean, (0, 0)) / variance;
+    (variance > MIN_NOISE && share > SHARED).then(|| {
+        (
+            "the reference has the noise of the noisy image",
+            "was it averaged with the noisy image, or continued from its samples? Render it with another seed",
+            format!("{:.0} % of it", 100.0 * share / (1.0 + share)),
+        )
+    })
 }
 
 /// Mean luminance of the image's blocks.
 fn block_means(image: &[f32], frame: &Frame) -> Vec<f64> {
-    let pixels = frame.width * frame.height;
+    let channels: Vec<&[f32]> = image.chunks_exact(frame.width * frame.height).collect();
+    block_means_of(&channels, &LUMINANCE, frame)
+}
+
+/// Means over blocks of the weighted sum of some channels.
+fn block_means_of(channels: &[&[f32]], weights: &[f32], frame: &Frame) -> Vec<f64> {
     let (columns, rows) = (frame.width / BLOCK, frame.height / BLOCK);
     let mut means = vec![0.0; columns * rows];
-    for (channel, weight) in image.chunks_exact(pixels).zip(LUMINANCE) {
+    for (channel, weight) in channels.iter().zip(weights) {
         for y in 0..rows * BLOCK {
             for x in 0..columns * BLOCK {
                 means[y / BLOCK * columns + x / BLOCK] +=
@@ -129,71 +295,15 @@ fn other_exposure([noisy, clean]: &[Vec<f64>; 2]) -> Option<Mistake> {
     })
 }
 
-/// Log luminance without the mean of 5x5 pixels.
-struct Details {
-    width: usize,
-    height: usize,
-    values: Vec<f64>,
-}
-
-impl Details {
-    fn of(image: &[f32], frame: &Frame) -> Option<Self> {
-        let Frame { width, height, .. } = *frame;
-        let log = log_luminance(image)?;
-        let mut values = vec![0.0; log.len()];
-        for y in FARTHEST..height.saturating_sub(FARTHEST) {
-            for x in FARTHEST..width.saturating_sub(FARTHEST) {
-                let rows = (y - FARTHEST..=y + FARTHEST).map(|row| row * width + x - FARTHEST);
-                let sum: f64 = rows
-                    .flat_map(|start| &log[start..=start + 2 * FARTHEST])
-                    .sum();
-                values[y * width + x] = log[y * width + x] - sum / 25.0;
-            }
-        }
-        Some(Self {
-            width,
-            height,
-            values,
-        })
-    }
-
-    /// The details at a distance from the border, moved by `shift`.
-    fn moved(&self, shift: (isize, isize)) -> impl Iterator<Item = f64> {
-        let border = 2 * FARTHEST;
-        let columns = border..self.width - border;
-        let start = columns.start.wrapping_add_signed(shift.0);
-        let rows = (border..self.height - border).map(move |y| {
-            let y = y.wrapping_add_signed(shift.1);
-            &self.values[y * self.width + start..][..columns.len()]
-        });
-        rows.flatten().copied()
-    }
-
-    fn variance(&self) -> f64 {
-        mean(self.moved((0, 0)).map(|x| x * x))
-    }
-
-    /// Mean product with another image's details, of which the pixel at `shift` is taken.
-    fn covariance(&self, other: &Self, shift: (isize, isize)) -> f64 {
-        mean(
-            self.moved((0, 0))
-                .zip(other.moved(shift))
-                .map(|(a, b)| a * b),
-        )
-    }
-}
-
 fn shifted(noisy: &Details, clean: &Details) -> Option<Mistake> {
     let scale = (noisy.variance() * clean.variance()).sqrt();
     if scale == 0.0 {
         return None;
     }
-    let reach = FARTHEST as isize;
-    let shifts = (-reach..=reach).flat_map(|y| (-reach..=reach).map(move |x| (x, y)));
-    let found = shifts.map(|shift| (noisy.covariance(clean, shift) / scale, shift));
+    let found = shifts().map(|shift| (noisy.covariance(clean, shift) / scale, shift));
     let (best, shift) = found.max_by(|a, b| a.0.total_cmp(&b.0))?;
     let unmoved = noisy.covariance(clean, (0, 0)) / scale;
-    let error = 1.0 / (noisy.moved((0, 0)).count() as f64).sqrt();
+    let error = 1.0 / (noisy.count() as f64).sqrt();
     let (x, y) = shift;
     (best - unmoved > MIN_ERRORS * error).then(|| {
         (
@@ -219,11 +329,6 @@ fn noise(noisy: &Details, clean: &Details) -> Option<Mistake> {
             },
         )
     })
-}
-
-fn mean(values: impl Iterator<Item = f64>) -> f64 {
-    let (sum, count) = values.fold((0.0, 0_usize), |(sum, n), x| (sum + x, n + 1));
-    sum / count.max(1) as f64
 }
 
 /// Pearson's correlation; `None` if a list is constant.

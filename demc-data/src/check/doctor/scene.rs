@@ -2,6 +2,7 @@
 
 use demc_program::file::FileError;
 
+use super::alignment;
 use super::finding::Finding;
 use super::reference;
 use super::set::Image;
@@ -78,12 +79,20 @@ pub(super) fn examine(
             format!("by {correlation:.2}"),
         );
     }
-    findings.extend(reference::findings(
-        &scene.name,
-        &frame,
-        correlation.is_some(),
-    ));
-    findings.extend(features(&scene.name, &frame, layout));
+    let wrong = reference::findings(&scene.name, &frame, correlation.is_some());
+    let reference_is_wrong = !wrong.is_empty();
+    findings.extend(wrong);
+    let wrong = features(&scene.name, &frame, layout);
+    // Normals in another space or buffer are at other places, too.
+    if wrong.is_empty() {
+        findings.extend(alignment::findings(
+            &scene.name,
+            &frame,
+            layout,
+            reference_is_wrong,
+        ));
+    }
+    findings.extend(wrong);
     let image = Image::of(&frame);
     (findings, Some(image))
 }

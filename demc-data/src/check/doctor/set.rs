@@ -8,13 +8,19 @@ use std::path::PathBuf;
 use super::finding::Finding;
 use super::reference::correlation;
 use crate::dataset::Scene;
-use crate::image::frame::Frame;
+use crate::image::frame::{Frame, POSITIONS};
 use crate::input::ranges::{LUMINANCE, exposure};
 
 /// Largest distance of a scene's exposure from the median in stops (renders: 3.2).
 const MAX_STOPS: f64 = 4.0;
 /// Smallest correlation of two images of one view (renders: other views reach 0.83).
 const SAME_IMAGE: f64 = 0.95;
+/// Number of hashes of a sketch.
+const SKETCH: usize = 1024;
+/// Smallest share of equal positions of two images of one view (renders: other views share none).
+const SAME_PLACES: f64 = 0.3;
+/// Smallest number of hashes that tells that share.
+const FEWEST_PLACES: usize = 32;
 /// Width and height of the small images that are compared.
 const SIDE: usize = 32;
 /// Luminance that is added before a logarithm, in exposures.
@@ -28,6 +34,8 @@ pub(super) struct Image {
     small: Vec<f64>,
     /// Hash of all buffers.
     hash: u64,
+    /// The smallest hashes of the positions that the image shows, in order: a sketch (Broder 1997).
+    places: Vec<u64>,
 }
 
 impl Image {
@@ -46,8 +54,72 @@ impl Image {
                 Vec::new()
             },
             hash: hasher.finish(),
+            places: places(frame),
         }
     }
+
+    /// Whether both show the same view, and how that was found.
+    fn shows_view_of(&self, other: &Self) -> Option<String> {
+        let names = [
+            (correlation_of(&self.small, &other.small), "correlates"),
+            (
+                correlation_of(&mirrored(&self.small), &other.small),
+                "correlates, mirrored,",
+            ),
+        ];
+        let similar = names.into_iter().find_map(|(correlation, words)| {
+            let same = correlation.filter(|c| *c > SAME_IMAGE)?;
+            Some((words, format!("by {same:.3}")))
+        });
+        if let Some((words, value)) = similar {
+            return Some(format!("{words} with {{other}} {value}"));
+        }
+        let share = shared_places(&self.places, &other.places)?;
+        (share > SAME_PLACES).then(|| {
+            let percent = 100.0 * share;
+            format!(
+                "shares {percent:.0} % of its positions with {{other}}: a crop or a mirrored copy"
+            )
+        })
+    }
+}
+
+/// The smallest [`SKETCH`] hashes of the positions of pixels that hit a surface.
+fn places(frame: &Frame) -> Vec<u64> {
+    let pixels = frame.width * frame.height;
+    let position = |i: usize| [0, 1, 2].map(|c| frame.features[(POSITIONS + c) * pixels + i]);
+    let hits = (0..pixels).map(position).filter(|place| *place != [0.0; 3]);
+    let mut hashes: Vec<u64> = hits
+        .map(|place| {
+            let mut hasher = DefaultHasher::new();
+            place.map(f32::to_bits).hash(&mut hasher);
+            hasher.finish()
+        })
+        .collect();
+    hashes.sort_unstable();
+    hashes.dedup();
+    hashes.truncate(SKETCH);
+    hashes
+}
+
+/// Share of the positions of one image that the other one shows, too; `None` if the sketches are too small to
+/// tell.
+fn shared_places(a: &[u64], b: &[u64]) -> Option<f64> {
+    // Both sketches are complete up to here.
+    let end = *a.last()?.min(b.last()?);
+    let [a, b] = [a, b].map(|hashes| &hashes[..hashes.partition_point(|hash| *hash <= end)]);
+    let shared = a
+        .iter()
+        .filter(|hash| b.binary_search(hash).is_ok())
+        .count();
+    let fewest = a.len().min(b.len());
+    (fewest >= FEWEST_PLACES).then(|| shared as f64 / fewest as f64)
+}
+
+/// A small image mirrored left to right.
+fn mirrored(small: &[f64]) -> Vec<f64> {
+    let rows = small.chunks_exact(SIDE);
+    rows.flat_map(|row| row.iter().rev().copied()).collect()
 }
 
 /// Log luminance, averaged to 32x32 pixels.
@@ -156,13 +228,13 @@ fn duplicates(images: &[(&Scene, Image)]) -> Vec<Finding> {
                     format!("equal to {}", other.name),
                 ));
             } else if scene.split != other.split
-                && let Some(same) = correlation_of(image, earlier).filter(|c| *c > SAME_IMAGE)
+                && let Some(how) = image.shows_view_of(earlier)
             {
                 findings.push(Finding::new(
                     "views that are in both splits",
                     "test scores then favour what training saw; move both to one split",
                     &scene.name,
-                    format!("correlates with {} by {same:.3}", other.name),
+                    how.replace("{other}", &other.name),
                 ));
             }
         }
@@ -170,9 +242,9 @@ fn duplicates(images: &[(&Scene, Image)]) -> Vec<Finding> {
     findings
 }
 
-fn correlation_of(a: &Image, b: &Image) -> Option<f64> {
-    if a.small.len() == b.small.len() {
-        correlation(&a.small, &b.small)
+fn correlation_of(a: &[f64], b: &[f64]) -> Option<f64> {
+    if a.len() == b.len() {
+        correlation(a, b)
     } else {
         None
     }
