@@ -100,6 +100,9 @@ fn merge_strips_the_layer_of_a_blender_reference() {
     );
     let text = stdout(&["index", &dir.text("")]);
     assert!(text.contains("layout cycles"), "{text}");
+    // The manifest's only scene is for training.
+    let measured = stdout(&["stats", &dir.text("")]);
+    assert!(measured.contains("texture1.r"), "{measured}");
     let other = [
         "merge",
         "-o",
@@ -334,6 +337,15 @@ fn doctor_without_a_manifest_names_the_command_that_writes_it() {
     .expect("writable");
     refused(&["doctor", &root], 1, "lists no scenes");
     refused(&["doctor", &root, "--layout", "maya"], 1, "");
+    for size in ["0", "7", "100", "8192"] {
+        let output = demc_data(&["doctor", &root, "--patch-size", size]);
+        assert_eq!(output.status.code(), Some(2), "{size}");
+        let error = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(
+            error.contains("expected a multiple of 32 from 32 to 4096"),
+            "{error}"
+        );
+    }
 }
 
 #[test]

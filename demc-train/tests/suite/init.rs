@@ -246,3 +246,17 @@ fn weights_of_another_network_are_refused_before_anything_is_written() {
     );
     assert!(!second.exists());
 }
+
+/// `quality` and `fast` are the bundled models, whatever the current directory.
+#[test]
+fn a_bundled_model_starts_a_run() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    for name in ["quality", "fast"] {
+        let init = format!("--set=train.init={name}");
+        let output = train(&config, &dir.path().join("run"), &[&init, "--check"]);
+        let error = error_line(&output, 1);
+        let start = format!("error: train.init: {name}: weights of another network");
+        assert!(error.starts_with(&start), "{error}");
+    }
+}

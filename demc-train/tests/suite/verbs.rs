@@ -104,6 +104,7 @@ fn an_ablation_resumes_and_writes_table_and_figure() {
         1,
     );
     says(&other, "optimizer.lr_start: 0.5 instead of 0.001");
+    says(&other, "undo the edit, or name another directory");
 }
 
 #[test]

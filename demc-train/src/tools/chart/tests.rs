@@ -215,3 +215,16 @@ fn the_picture_has_room_for_the_longest_name() {
     let end = x + 0.62 * size * name.len() as f64;
     assert!(end < 2.0 * shown, "{end} of {}", 2.0 * shown);
 }
+
+#[test]
+fn a_name_may_have_its_ending_already() {
+    let name = |stem: &str, ending: &str| {
+        let path = with_extension(Path::new(stem), ending).expect("a name");
+        path.to_str().expect("UTF-8").to_owned()
+    };
+    assert_eq!(name("a/p", "svg"), "a/p.svg");
+    assert_eq!(name("a/p.svg", "svg"), "a/p.svg");
+    assert_eq!(name("a/p.svg", "csv"), "a/p.csv");
+    assert_eq!(name("a/run.2", "svg"), "a/run.2.svg");
+    assert!(with_extension(Path::new("a/"), "svg").is_err());
+}
