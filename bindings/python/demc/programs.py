@@ -33,10 +33,10 @@ def denoise_exr(
         layout: preset or TOML file of the channels; by default the one that fits.
         layers: names or glob patterns of further channels to denoise. Needs a kernel head.
         repair: whether NaN, infinite, and negative samples are replaced by the median around them.
-        overwrite: whether an existing target is replaced.
+        overwrite: whether an existing target is replaced. One that was made with these options stays as it is.
 
     Raises:
-        DemcError: an image or a model that cannot be used; an existing target.
+        DemcError: an image or a model that cannot be used; an existing target of other options or another program.
         OSError: a file that cannot be read or written.
         KeyboardInterrupt: after Ctrl-C, when the image is done.
     """

@@ -220,12 +220,13 @@ class Programs(Runs):
         demc.denoise_exr(source, ours, model=ROOT / "models" / "quality.safetensors")
         subprocess.run([program("demc-infer"), "denoise", source, "-o", theirs], check=True, capture_output=True)
         self.assertEqual(ours.read_bytes(), theirs.read_bytes())
+        demc.denoise_exr(source, ours)  # It is finished.
         for error, text, arguments in (
-            (demc.DemcError, "ours-2.exr exists; --overwrite replaces it", (source, ours)),
-            (FileNotFoundError, "none.exr", (self.folder / "none.exr", self.folder / "new.exr")),
+            (demc.DemcError, "ours-2.exr exists, made with --model quality instead of fast", (source, ours, "fast")),
+            (FileNotFoundError, "none.exr", (self.folder / "none.exr", self.folder / "new.exr", "fast")),
         ):
             with self.assertRaises(error) as caught:
-                demc.denoise_exr(*arguments)
+                demc.denoise_exr(*arguments[:2], model=arguments[2])
             self.assertIn(text, str(caught.exception))
         demc.denoise_exr(source, ours, overwrite=True)
 

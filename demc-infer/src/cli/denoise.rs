@@ -196,7 +196,7 @@ impl Arguments {
 
     /// The options that change an output.
     fn record(&self, bundle: &Bundle) -> anyhow::Result<Record> {
-        let mut record = Record::of_model(&self.model.name(), &bundle.checksum()?);
+        let mut record = Record::of_model(&self.model.short_name(), &bundle.checksum()?);
         self.layout.record(&mut record);
         self.layers.record(&mut record);
         self.output_flags.record(&mut record);

@@ -27,6 +27,12 @@ impl ModelFlag {
         self.path.display().to_string()
     }
 
+    /// The model's name without directory and extension, for records: one model has one, wherever it lies.
+    pub fn short_name(&self) -> String {
+        let name = self.path.file_stem().unwrap_or(self.path.as_os_str());
+        name.to_string_lossy().into_owned()
+    }
+
     /// Protects the model's files from being replaced.
     pub fn protect(&self, outputs: &mut Outputs) {
         for file in locate::files(&self.path) {
