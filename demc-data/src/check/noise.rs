@@ -89,13 +89,18 @@ pub fn correlation(color_hdr: &[f32], width: usize, height: usize) -> Option<f32
 /// `ln(luminance + 0.05 exposure)` of each pixel; `None` of a black image.
 pub(crate) fn log_luminance(color_hdr: &[f32]) -> Option<Vec<f64>> {
     let dark = DARK * exposure(color_hdr);
+    (dark > 0.0 && dark.is_finite()).then(|| log_luminance_above(color_hdr, dark))
+}
+
+/// `ln(luminance + dark)` of each pixel.
+pub(crate) fn log_luminance_above(color_hdr: &[f32], dark: f64) -> Vec<f64> {
     let pixels = color_hdr.len() / 3;
     let log = (0..pixels).map(|i| {
         let channels = LUMINANCE.iter().enumerate();
         let luminance: f32 = channels.map(|(c, y)| y * color_hdr[c * pixels + i]).sum();
         (f64::from(luminance.max(0.0)) + dark).ln()
     });
-    (dark > 0.0 && dark.is_finite()).then(|| log.collect())
+    log.collect()
 }
 
 /// The differences of a block from a plane through it, row by row.

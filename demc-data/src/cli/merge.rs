@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::Args;
+use demc_program::cli::OverwriteFlag;
 use demc_program::exit::{self, UsageError};
 use demc_program::message::{self, printable};
 use demc_program::output::{Directories, Outputs};
@@ -26,9 +27,8 @@ pub struct Arguments {
     /// Remove `LAYER.` from the channel names of files with a NAME, such as ViewLayer.Combined
     #[arg(long, value_name = "LAYER")]
     strip: Option<String>,
-    /// Replace an existing output
-    #[arg(long)]
-    overwrite: bool,
+    #[command(flatten)]
+    overwrite: OverwriteFlag,
 }
 
 /// A file argument: `FILE` or `NAME=FILE`.
@@ -51,7 +51,7 @@ impl Arguments {
         for Source { path, .. } in &sources {
             outputs.protect(path, &format!("the input {}", path.display()));
         }
-        outputs.claim(output, self.overwrite)?;
+        outputs.claim(output, self.overwrite.overwrite)?;
         outputs.prepare(Directories::Expect)?;
         let mut inputs = Vec::with_capacity(sources.len());
         for Source { prefix, path } in sources {

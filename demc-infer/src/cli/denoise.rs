@@ -1,12 +1,12 @@
 //! `demc-infer denoise`: denoises EXR files one after another.
 
 use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use clap::{Args, ValueEnum};
-use demc_data::image::exr::{Compression, ExrFile};
+use clap::Args;
+use demc_data::image::exr::ExrFile;
 use demc_data::image::frame::{decode_input, decode_repaired};
-use demc_data::image::rewrite::{OutputChannels, Replaced, WriteOptions, rewrite_with_layers};
+use demc_data::image::rewrite::Replaced;
 use demc_data::input::ranges;
 use demc_data::{ChannelLayout, Frame};
 use demc_program::message;
@@ -20,6 +20,7 @@ use super::inputs::Inputs;
 use super::jobs::{Job, Jobs};
 use super::layers::{LayersFlag, read_layers};
 use super::layouts::{LayoutFlags, Layouts};
+use super::output_flags::OutputFlags;
 use super::preview;
 use super::progress::Progress;
 use super::record::Record;
@@ -394,78 +395,4 @@ struct Contents {
     layers: Vec<Layer>,
     /// Number of samples that were repaired.
     repaired: usize,
-}
-
-/// `--precision`, `--compression`, `--only-color`.
-#[derive(Args)]
-struct OutputFlags {
-    /// Type of the channels of colour and layers: half has 11 bits of precision and a maximum of 65504 [default:
-    /// as the input]
-    #[arg(long, value_enum)]
-    precision: Option<OutputPrecision>,
-    /// none, rle, zips, zip, piz, pxr24, b44, b44a, dwaa or dwab. The last five are lossy [default:
-    /// as the input, or zip if that would change the copied channels]
-    #[arg(long, value_name = "NAME")]
-    compression: Option<Compression>,
-    /// Write only colour, alpha and layers
-    #[arg(long)]
-    only_color: bool,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-enum OutputPrecision {
-    /// 16-bit floating point
-    Half,
-    /// 32-bit floating point
-    Float,
-}
-
-impl OutputFlags {
-    fn record(&self, record: &mut Record) {
-        if let Some(precision) = self
-            .precision
-            .and_then(|precision| precision.to_possible_value())
-        {
-            record.add("--precision", precision.get_name());
-        }
-        if let Some(compression) = self.compression {
-            record.add("--compression", compression);
-        }
-        if self.only_color {
-            record.add("--only-color", "on");
-        }
-    }
-
-    /// Writes `output`: `input` with the denoised channels. Returns notes about other differences
-    /// from the input.
-    fn write(
-        &self,
-        input: &mut ExrFile,
-        output: &Path,
-        replaced: &Replaced,
-        record: &str,
-    ) -> Result<Vec<String>, demc_data::Error> {
-        let options = WriteOptions {
-            channels: if self.only_color {
-                OutputChannels::Color
-            } else {
-                OutputChannels::All
-            },
-            precision: self.precision.map(|precision| match precision {
-                OutputPrecision::Half => demc_data::SamplePrecision::Half,
-                OutputPrecision::Float => demc_data::SamplePrecision::Float,
-            }),
-            compression: self.compression,
-            record: Some(record),
-        };
-        let written = rewrite_with_layers(input, replaced, output, &options)?;
-        let mut notes: Vec<String> = written.changes.iter().map(ToString::to_string).collect();
-        if written.clamped > 0 {
-            let clamped = written.clamped;
-            notes.push(format!(
-                "{clamped} samples above 65504, the maximum of half, are written as 65504"
-            ));
-        }
-        Ok(notes)
-    }
 }

@@ -19,6 +19,7 @@ mod inspect;
 mod jobs;
 mod layers;
 mod layouts;
+mod output_flags;
 mod outputs;
 mod preview;
 mod progress;

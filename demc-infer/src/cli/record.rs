@@ -1,7 +1,7 @@
 //! How an output was made. The record stands in its header, and a repeated command compares it with
 //! its own options.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
@@ -59,8 +59,7 @@ impl Record {
             let value = record.0.get(flag).map(String::as_str);
             value.unwrap_or(DEFAULT).to_owned()
         };
-        let flags: std::collections::BTreeSet<&String> =
-            self.0.keys().chain(then.0.keys()).collect();
+        let flags: BTreeSet<&String> = self.0.keys().chain(then.0.keys()).collect();
         let mut found = Vec::new();
         for flag in flags {
             let (now, before) = (value(self, flag), value(then, flag));

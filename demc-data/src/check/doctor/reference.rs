@@ -5,6 +5,7 @@
 
 use super::details::{Details, mean, shifts};
 use super::finding::Finding;
+use crate::check::noise::log_luminance_above;
 use crate::image::frame::Frame;
 use crate::input::ranges::{LUMINANCE, exposure};
 
@@ -82,7 +83,7 @@ fn mistake(frame: &Frame, reference: &[f32], filtered: bool) -> Option<Mistake> 
         .or_else(|| another_view(&means))
         .or_else(|| other_exposure(&means))
         .or_else(|| clamped(frame, reference))
-        .or_else(|| encoded(frame, reference))
+        .or_else(|| encoded(frame, reference, &means))
         .or_else(|| {
             let images = [&frame.color[..], reference];
             let [noisy, clean] = images.map(|image| Details::of(image, frame));
@@ -164,27 +165,16 @@ fn clamped(frame: &Frame, reference: &[f32]) -> Option<Mistake> {
 }
 
 /// Images that are encoded for a display. The mean of encoded noise is darker than the encoded mean.
-fn encoded(frame: &Frame, reference: &[f32]) -> Option<Mistake> {
-    let darker = |linear: bool| {
-        let [noisy, clean] = [&frame.color[..], reference].map(|image| {
-            if linear {
-                block_means(
-                    &image.iter().copied().map(linear_of).collect::<Vec<f32>>(),
-                    frame,
-                )
-            } else {
-                block_means(image, frame)
-            }
-        });
-        let dark = BRIGHT * mean(clean.iter().copied());
-        let pairs = noisy.iter().zip(&clean).filter(|(_, clean)| **clean > dark);
-        let mut ratios: Vec<f64> = pairs.map(|(noisy, clean)| (noisy / clean).ln()).collect();
-        ratios.sort_by(f64::total_cmp);
-        ratios.get(ratios.len() / 2).copied()
-    };
-    let as_is = darker(false)?;
-    let linear = darker(true)?;
-    (as_is < -DARKER && linear.abs() < CLOSER * as_is.abs()).then(|| {
+fn encoded(frame: &Frame, reference: &[f32], means: &[Vec<f64>; 2]) -> Option<Mistake> {
+    let as_is = log_ratio(means)?;
+    if as_is >= -DARKER {
+        return None;
+    }
+    let linear = log_ratio(&[&frame.color[..], reference].map(|image| {
+        let decoded: Vec<f32> = image.iter().copied().map(linear_of).collect();
+        block_means(&decoded, frame)
+    }))?;
+    (linear.abs() < CLOSER * as_is.abs()).then(|| {
         (
             "noise makes the noisy image darker than the reference",
             "are both encoded for a display (sRGB)? Training needs linear radiance",
@@ -195,6 +185,15 @@ fn encoded(frame: &Frame, reference: &[f32]) -> Option<Mistake> {
             ),
         )
     })
+}
+
+/// The median over the brighter blocks of the logarithm of noisy image by reference.
+fn log_ratio([noisy, clean]: &[Vec<f64>; 2]) -> Option<f64> {
+    let dark = BRIGHT * mean(clean.iter().copied());
+    let pairs = noisy.iter().zip(clean).filter(|(_, clean)| **clean > dark);
+    let mut ratios: Vec<f64> = pairs.map(|(noisy, clean)| (noisy / clean).ln()).collect();
+    ratios.sort_by(f64::total_cmp);
+    ratios.get(ratios.len() / 2).copied()
 }
 
 /// The inverse of the sRGB curve.
@@ -209,17 +208,8 @@ fn linear_of(value: f32) -> f32 {
 /// A reference that contains the noise of the noisy image: the difference of both then correlates with it.
 fn mixed(frame: &Frame, reference: &[f32]) -> Option<Mistake> {
     let dark = DARK * exposure(reference);
-    let [noisy, clean] = [&frame.color[..], reference].map(|image| {
-        let pixels = frame.width * frame.height;
-        let log = (0..pixels).map(|i| {
-            let channels = LUMINANCE.iter().enumerate();
-            let luminance: f32 = channels
-                .map(|(c, weight)| weight * image[c * pixels + i])
-                .sum();
-            (f64::from(luminance) + dark).ln()
-        });
-        log.collect::<Vec<f64>>()
-    });
+    let [noisy, clean] =
+        [&frame.color[..], reference].map(|image| log_luminance_above(image, dark));
     let difference: Vec<f64> = noisy.iter().zip(&clean).map(|(a, b)| a - b).collect();
     let [noise, clean] = [&difference, &clean].map(|image| Details::without_mean(image, frame));
     let variance = noise.variance();
