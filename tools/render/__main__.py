@@ -6,6 +6,7 @@
     python tools/render -o data/mine kitchen.xml hall.xml            own scenes; a sensor is a view
     python tools/render -o data/rooms --rooms 60 --with data/sample  lists other scenes, too
     python tools/render -o data/rooms --rooms 60 --spp 1,4,16        three noisy images per view
+    python tools/render -o data/rooms --rooms 60 --passes paper      what NFOR and KPCN need (docs/data.md#passes)
     python tools/render -o data/rooms --rooms 60 --shard 1/4         a part, on a farm (docs/farms.md)
     python tools/render -o data/bundled --preset train               the training data of the bundled models
     python tools/render -o data/heldout --preset heldout             their test scenes
@@ -97,7 +98,9 @@ def main() -> None:
             files, traits = wanted[name]
             try:
                 said = []
-                images = views.photograph(scene, view, (base.seed + view) * 1000, base.budget, [*files], traits)
+                images = views.photograph(
+                    scene, view, (base.seed + view) * 1000, base.budget, [*files], traits, args.passes is not None
+                )
                 for (channels, facts), file in zip(images, files.values()):
                     place = {"name": file, "split": args.split, "base": base.name, "file": f"{args.split}/{file}.exr"}
                     if args.counts:
@@ -221,6 +224,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--spp", type=numbers, default=[4], metavar="N,...", help="samples per pixel of the noisy images [4]")
     parser.add_argument("--counts", type=int, metavar="N", help="largest number of noisy images per view, drawn from --spp [all]")
     parser.add_argument("--traits", type=float, default=0.0, metavar="SHARE", help="share of the views with a Gaussian pixel filter, with albedo behind glass, and with another exposure, each [0]")
+    parser.add_argument("--passes", choices=("paper",), help="also write what the paper's comparison needs: half buffers, variances, depth, diffuse and specular parts")
     parser.add_argument("--ref-spp", type=int, default=128, metavar="N", help="largest number of samples per pixel of the reference [128]")
     parser.add_argument("--residual", type=float, default=0.03, metavar="X", help="expected RelMSE at which a reference is good enough [0.03]")
     parser.add_argument("--reserved", action="store_true", help="furniture, textures, and lights that rooms and still lifes do not have otherwise")
@@ -237,6 +241,8 @@ def arguments() -> argparse.Namespace:
     stems = [path.stem for path in args.scenes]
     if len(set(stems)) < len(stems):
         parser.error("two scene files have the same name")
+    if args.passes and (args.traits or any(count % 2 for count in args.spp)):
+        parser.error("--passes needs --traits 0 and even numbers of --spp, for two halves")
     return args
 
 

@@ -24,8 +24,8 @@ CLAMP = 45.0
 """Upper limit of a sample, in units of that mean."""
 PROBE_SAMPLES = 8
 """Samples per pixel for measuring the mean."""
-PASS_SAMPLES = 16
-"""Samples per pixel of one pass of the reference. Passes alternate between two halves."""
+ROUND_SAMPLES = 16
+"""Samples per pixel of one round of the reference. Rounds alternate between two halves."""
 EPSILON = 0.001
 """Epsilon of RelMSE (Eq. 5)."""
 USUAL = 4
@@ -34,7 +34,22 @@ FEW, MANY = 64, 1 << 31
 """Noisy images of more samples per pixel than `FEW` use seeds from `MANY` on."""
 REFERENCE_SHARE = 4
 """A reference has at least this many times the samples of the noisy image, or a residual below this part of its noise."""
-CHANNELS = {"normal.": "XYZ", "position.": "XYZ", "albedo1.": "RGB", "albedo2.": "RGB", "mask.": "A"}
+CHANNELS = {
+    "color": ("", "RGB"),
+    "normal": ("normal.", "XYZ"),
+    "position": ("position.", "XYZ"),
+    "albedo1": ("albedo1.", "RGB"),
+    "albedo2": ("albedo2.", "RGB"),
+    "mask": ("mask.", "A"),
+    "depth": ("depth.", "Z"),
+    "diffuse": ("diffuse.", "RGB"),
+    "specular": ("specular.", "RGB"),
+}
+"""Start and ends of each buffer's channel names."""
+HALVES = ("color", "normal", "albedo1", "depth")
+"""Buffers that have two half buffers, `half1.NAME` and `half2.NAME`, with passes."""
+PARTS = ("diffuse", "specular")
+"""The parts of colour and reference."""
 GUIDES = ("normal", "albedo1")
 """Features of the reference's own samples that are written, for `tools/references.py`."""
 
@@ -77,11 +92,12 @@ class Traits:
 
 
 def photograph(
-    scene, view: int, seed: int, budget: Budget, counts: list[int], traits: Traits = Traits()
+    scene, view: int, seed: int, budget: Budget, counts: list[int], traits: Traits = Traits(), passes: bool = False
 ) -> list[tuple[dict[str, np.ndarray], dict]]:
     """For each number of samples per pixel in `counts`: channels of the EXR file, `[H, W]` each, and facts for the manifest.
 
-    An image of more samples contains those of fewer. The reference has others.
+    An image of more samples contains those of fewer. The reference has others. With `passes`, there are
+    also half buffers, variances, depth, and the diffuse and the specular part of colour and reference.
     """
     probe = tracer.render(scene, PROBE_SAMPLES, seed, view=view)
     luminance = np.sort((probe.color / probe.count @ [0.2126, 0.7152, 0.0722]).ravel())
@@ -94,26 +110,18 @@ def photograph(
         raise Unsuitable("blocked")
     scale, clamp = LUMINANCE / mean, CLAMP * mean
 
-    images, noisy = [], None
-    for count in sorted(counts):
-        added = count - (noisy.count if noisy else 0)
-        # Seeds that neither the reference nor other views use.
-        start = seed + 10 if count <= FEW and not noisy else seed + MANY + count
-        noisy = tracer.render(scene, added, start, clamp, view, traits.follow).plus(noisy)
-        means = {name: planes / count for name, planes in {"color": noisy.color * scale, **noisy.features}.items()}
-        images.append((count, {name: filtered(planes, traits.pixel_filter) for name, planes in means.items()}))
-
-    halves, count, guides = [0.0, 0.0], 0, dict.fromkeys(GUIDES, 0.0)
+    images = noisy_images(scene, view, seed, (scale, clamp), sorted(counts), traits, passes)
+    halves, count, others = [0.0, 0.0], 0, dict.fromkeys((*GUIDES, *(PARTS if passes else ())), 0.0)
     largest = max(budget.ref_samples, REFERENCE_SHARE * max(counts))
     while True:
         for half in range(2):
-            start = seed + 100 + count + PASS_SAMPLES * half
-            traced = tracer.render(scene, PASS_SAMPLES, start, clamp, view, traits.follow)
+            start = seed + 100 + count + ROUND_SAMPLES * half
+            traced = tracer.render(scene, ROUND_SAMPLES, start, clamp, view, traits.follow, passes)
             halves[half] = halves[half] + traced.color / traced.count
-            guides = {name: total + traced.features[name] for name, total in guides.items()}
-        count += 2 * PASS_SAMPLES
-        passes = count / (2 * PASS_SAMPLES)
-        a, b = (filtered(half / passes * scale, traits.pixel_filter) for half in halves)
+            others = {name: total + traced.features[name] for name, total in others.items()}
+        count += 2 * ROUND_SAMPLES
+        rounds = count / (2 * ROUND_SAMPLES)
+        a, b = (filtered(half / rounds * scale, traits.pixel_filter) for half in halves)
         reference = (a + b) / 2
         residual = rel_mse((a - b) / 2, reference)
         noises = [rel_mse(image["color"] - reference, reference) - residual for _, image in images]
@@ -126,18 +134,12 @@ def photograph(
 
     found = []
     for (samples, image), noise in zip(images, noises):
-        buffers = {"": ("RGB", image["color"] * traits.exposure), "ref.": ("RGB", reference * traits.exposure)}
-        for (prefix, names), name in zip(CHANNELS.items(), tracer.FEATURES):
-            buffers[prefix] = (names, image[name])
-            if name in GUIDES:
-                buffers["ref." + prefix] = (names, filtered(guides[name] / count, traits.pixel_filter))
-        channels = {}
-        for prefix, (names, planes) in buffers.items():
-            coarse = prefix == "position." and too_coarse(planes) or prefix in ("", "ref.") and traits.exposure != 1
-            kind = np.float32 if coarse else np.float16
-            limit = np.finfo(kind).max
-            for i, name in enumerate(names):
-                channels[prefix + name] = np.ascontiguousarray(planes[..., i].clip(-limit, limit).astype(kind))
+        buffers = image | {"ref.color": reference}
+        for name, total in others.items():
+            buffers["ref." + name] = filtered(total / count * (scale if name in PARTS else 1), traits.pixel_filter)
+        for name in ("color", "ref.color"):
+            buffers[name] = buffers[name] * traits.exposure
+        channels = file_channels(buffers, traits.exposure != 1)
         height, width, _ = reference.shape
         facts = {
             "width": width,
@@ -154,8 +156,59 @@ def photograph(
         }
         if traits != Traits():
             facts |= {"pixel_filter_sigma": traits.pixel_filter, "albedo_behind_glass": traits.follow}
+        if passes:
+            facts["passes"] = "paper"
         found.append((channels, facts))
     return found
+
+
+def noisy_images(
+    scene, view: int, seed: int, limits: tuple[float, float], counts: list[int], traits: Traits, passes: bool
+) -> list[tuple[int, dict[str, np.ndarray]]]:
+    """The number of samples per pixel and the buffers of each noisy image, `[H, W, C]` each.
+
+    `limits` are the factor on radiance, and the limit of a sample.
+    """
+    scale, clamp = limits
+    images, halves = [], [None] * (2 if passes else 1)
+    for count in counts:
+        added = (count - sum(half.count for half in halves if half)) // len(halves)
+        # Seeds that neither the reference nor other views use.
+        start = seed + 10 if count <= FEW and not images else seed + MANY + count
+        for i, half in enumerate(halves):
+            traced = tracer.render(scene, added, start + i * added, clamp, view, traits.follow, passes)
+            halves[i] = traced.plus(half)
+        noisy = halves[0].plus(halves[1] if passes else None)
+        factor = lambda name: scale if name in ("color", *PARTS) else 1.0
+        buffers = {name: noisy.mean(name) * factor(name) for name in ("color", *noisy.features)}
+        for name in noisy.squares:
+            buffers[f"variance.{name}"] = noisy.variance(name) * factor(name) ** 2
+        for i, half in enumerate(halves):
+            buffers |= {f"half{i + 1}.{name}": half.mean(name) * factor(name) for name in HALVES if passes}
+        images.append((count, {name: filtered(planes, traits.pixel_filter) for name, planes in buffers.items()}))
+    return images
+
+
+def file_channels(buffers: dict[str, np.ndarray], scaled: bool) -> dict[str, np.ndarray]:
+    """The channels of a file, `[H, W]` each: half floats where they are exact enough.
+
+    `scaled`: radiance may be too bright or too dark for half floats.
+    """
+    channels = {}
+    for buffer, planes in buffers.items():
+        before, _, name = buffer.rpartition(".")
+        before += "." if before else ""
+        prefix, ends = CHANNELS[name]
+        coarse = (
+            before == "variance."
+            or (name in ("position", "depth") and too_coarse(planes))
+            or (name == "color" and scaled)
+        )
+        kind = np.float32 if coarse else np.float16
+        limit = np.finfo(kind).max
+        for i, end in enumerate(ends):
+            channels[before + prefix + end] = np.ascontiguousarray(planes[..., i].clip(-limit, limit).astype(kind))
+    return channels
 
 
 def filtered(planes: np.ndarray, sigma: float) -> np.ndarray:

@@ -61,6 +61,55 @@ class Render(unittest.TestCase):
         # The difference of two equally noisy images has sqrt(2) of the noise of one.
         self.assertLess(np.abs(ours - theirs).mean(), 2 * noise)
 
+    def test_passes_add_up_and_variances_are_those_of_repeated_renders(self) -> None:
+        import numpy as np
+        import tracer
+        from variant import mi
+
+        scene = mi.load_dict(self.scene())
+        # A few bright samples decide the mean variance: 16 runs differ from it by up to a fifth.
+        plain = tracer.render(scene, 32, 1000, clamp=2)
+        runs = [tracer.render(scene, 32, 1000 + 100 * i, clamp=2, passes=True) for i in range(16)]
+        np.testing.assert_array_equal(plain.color, runs[0].color)
+        for run in runs:
+            np.testing.assert_allclose(run.mean("diffuse") + run.mean("specular"), run.mean("color"), atol=1e-5)
+        for name in tracer.VARIANCES:
+            means = np.stack([run.mean(name) for run in runs])
+            variances = np.stack([run.variance(name) for run in runs])
+            np.testing.assert_allclose(means.var(0, ddof=1).mean(), variances.mean(), rtol=0.35, err_msg=name)
+        diffuse, specular = (np.mean([run.mean(name) for run in runs], 0) for name in ("diffuse", "specular"))
+        wall = np.s_[8:24, 1:4]
+        self.assertEqual(specular[wall].max(), 0)
+        # The plastic wall has both lobes, the metal ball one.
+        plastic = np.s_[4:10, 10:22]
+        self.assertGreater(diffuse[plastic].mean(), 0.01)
+        self.assertGreater(specular[plastic].mean(), 1e-4)
+        depth = runs[0].mean("depth")
+        self.assertTrue(3 < depth[16, 16, 0] < 5.5, depth[16, 16])
+
+    def test_passes_are_written(self) -> None:
+        import OpenEXR
+
+        with tempfile.TemporaryDirectory() as folder:
+            small = ("--rooms", 1, "--views", 1, "--size", 64, "--spp", "4,8", "--ref-spp", 32, "--residual", 1)
+            done = run("-o", folder, *small, "--passes", "paper")
+            self.assertEqual(done.returncode, 0, done.stderr)
+            found = sorted(Path(folder).glob("train/*.exr"))
+            self.assertEqual(len(found), 2, done.stdout)
+            for path in found:
+                with OpenEXR.File(str(path), separate_channels=True) as file:
+                    planes = {name: channel.pixels.astype(float) for name, channel in file.channels().items()}
+                for name in ("R", "normal.X", "albedo1.G", "depth.Z"):
+                    mean = (planes[f"half1.{name}"] + planes[f"half2.{name}"]) / 2
+                    self.assertLess(abs(mean - planes[name]).mean(), 0.002 * abs(planes[name]).mean())
+                    self.assertGreater(planes[f"variance.{name}"].max(), 0)
+                for start in ("", "ref."):
+                    parts = planes[start + "diffuse.R"] + planes[start + "specular.R"]
+                    self.assertLess(abs(parts - planes[start + "R"]).mean(), 0.002)
+            odd = run("-o", folder, *small, "--passes", "paper", "--spp", "1,4")
+            self.assertEqual(odd.returncode, 2)
+            self.assertIn("even numbers of --spp", odd.stderr)
+
     def test_features_are_those_of_mitsubas_aov_integrator(self) -> None:
         import numpy as np
         import tracer

@@ -206,6 +206,7 @@ class Buffers(Files):
             (good.replace('"zeros"', '"copy-texture1"'), 'missing.normal cannot be "copy-texture1"'),
             (good.replace('"zeros"', '"black"'), "missing.normal: expected"),
             (good + "mask = 3", "mask: expected the name of a channel"),
+            (good + "passes = 3", "passes: expected a table"),
             ("color = [", "channel layout "),
         ]:
             layout.write_text(text)

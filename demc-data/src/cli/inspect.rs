@@ -12,6 +12,7 @@ use serde::Serialize;
 use super::number::number;
 use crate::image::channel::{Channel, ChannelType};
 use crate::image::exr::ExrFile;
+use crate::image::layout::{MissingPolicies, detect};
 use crate::image::plane::Plane;
 
 #[derive(Args)]
@@ -29,6 +30,8 @@ pub struct Arguments {
 struct ChannelRow {
     name: String,
     layer: Option<String>,
+    /// The buffer of the layout that fits the file.
+    buffer: Option<String>,
     #[serde(rename = "type")]
     kind: ChannelType,
     size: String,
@@ -88,14 +91,20 @@ fn rows(path: &Path) -> Result<Vec<ChannelRow>> {
         .map(|channel| channel.name.as_str())
         .collect();
     let planes = file.read(&names)?;
+    let layout = detect(&file, MissingPolicies::default(), None).ok();
+    let buffers = layout.map_or_else(Vec::new, |found| found.layout.buffers());
+    let buffer = |name: &String| {
+        let found = buffers.iter().find(|buffer| buffer.channels.contains(name));
+        found.map(|buffer| buffer.content.clone())
+    };
     Ok(channels
         .iter()
         .zip(&planes)
-        .map(|(channel, plane)| row(channel, plane))
+        .map(|(channel, plane)| row(channel, buffer(&channel.name), plane))
         .collect())
 }
 
-fn row(channel: &Channel, plane: &Plane) -> ChannelRow {
+fn row(channel: &Channel, buffer: Option<String>, plane: &Plane) -> ChannelRow {
     let samples = plane.to_f32();
     let finite = samples.iter().copied().filter(|sample| sample.is_finite());
     let count = finite.clone().count();
@@ -107,6 +116,7 @@ fn row(channel: &Channel, plane: &Plane) -> ChannelRow {
     ChannelRow {
         name: channel.name.clone(),
         layer: channel.layer.clone(),
+        buffer,
         kind: channel.kind,
         size: channel.window.to_string(),
         range,
@@ -134,8 +144,19 @@ fn table(report: &FileReport) -> String {
     }
     let _ = write!(
         text,
-        "\n  {:name_width$}  {:5}  {:size_width$}  {:>11}  {:>11}  {:>11}  {:>7}",
-        "channel", "type", "size", "min", "max", "mean", "NaN/inf"
+        "\n  {:name_width$}  {:5}  {:size_width$}  {:>11}  {:>11}  {:>11}  {:>7}{}",
+        "channel",
+        "type",
+        "size",
+        "min",
+        "max",
+        "mean",
+        "NaN/inf",
+        if rows.iter().any(|row| row.buffer.is_some()) {
+            "  buffer"
+        } else {
+            ""
+        }
     );
     for row in rows {
         let [min, max, mean] = match &row.range {
@@ -147,6 +168,9 @@ fn table(report: &FileReport) -> String {
             "\n  {:name_width$}  {:5}  {:size_width$}  {min:>11}  {max:>11}  {mean:>11}  {:>7}",
             row.name, row.kind, row.size, row.non_finite
         );
+        if let Some(buffer) = &row.buffer {
+            let _ = write!(text, "  {buffer}");
+        }
     }
     text
 }

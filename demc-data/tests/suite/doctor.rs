@@ -561,3 +561,114 @@ fn planted_mistakes_are_found() {
     println!("{found} of 186");
     assert!(found >= 165, "{found}");
 }
+
+/// Channels of half buffers, variances, depth, and parts, as `tools/render --passes paper` writes them.
+fn add_passes(planes: &mut Planes) {
+    let noise = |i: usize| [0.9, 1.1][i.wrapping_mul(2_654_435_761) >> 7 & 1];
+    let mut passes = Planes::new();
+    let depth: Vec<f32> = planes["position.Z"].iter().map(|z| 1.0 + z.abs()).collect();
+    passes.insert("depth.Z".to_owned(), depth);
+    for (name, whole) in planes.iter() {
+        let (prefix, end) = name.rsplit_once('.').unwrap_or(("", name));
+        let reference = if prefix == "ref" { "ref." } else { "" };
+        if prefix.is_empty() || prefix == "ref" {
+            for (part, share) in [("diffuse", 0.75), ("specular", 0.25)] {
+                let samples = whole.iter().map(|x| x * share).collect();
+                passes.insert(format!("{reference}{part}.{end}"), samples);
+            }
+        }
+    }
+    let all: Planes = planes
+        .iter()
+        .chain(&passes)
+        .map(|(n, p)| (n.clone(), p.clone()))
+        .collect();
+    for (name, whole) in &all {
+        let (prefix, _) = name.rsplit_once('.').unwrap_or(("", name));
+        if ["", "normal", "albedo1", "depth"].contains(&prefix) {
+            let half = |sign: f32| {
+                let samples = whole.iter().enumerate();
+                samples
+                    .map(|(i, x)| x * (1.0 + sign * (noise(i) - 1.0)))
+                    .collect::<Vec<f32>>()
+            };
+            passes.insert(format!("half1.{name}"), half(1.0));
+            passes.insert(format!("half2.{name}"), half(-1.0));
+        }
+        if ["", "normal", "albedo1", "depth", "diffuse", "specular"].contains(&prefix) {
+            let variance = whole.iter().map(|x| (0.1 * x).powi(2)).collect();
+            passes.insert(format!("variance.{name}"), variance);
+        }
+    }
+    planes.extend(passes);
+}
+
+#[test]
+fn wrong_passes_are_told_apart() {
+    let sound = Set::damaged(add_passes);
+    assert_eq!(sound.examine().problems, []);
+
+    let damaged = |damage: &dyn Fn(&mut Planes)| {
+        Set::damaged(|planes| {
+            add_passes(planes);
+            damage(planes);
+        })
+    };
+    let lacking = damaged(&|planes| drop(planes.remove("variance.depth.Z")));
+    assert!(
+        lacking
+            .has("passes are incomplete", "bad")
+            .starts_with("variance.depth.Z;")
+    );
+    let equal = damaged(&|planes| {
+        for name in ["R", "G", "B"] {
+            let whole = planes[name].clone();
+            planes.insert(format!("half1.{name}"), whole.clone());
+            planes.insert(format!("half2.{name}"), whole);
+        }
+    });
+    equal.has("the half buffers of color are equal", "bad");
+    let scaled = damaged(&|planes| {
+        for name in ["half1.normal.X", "half1.normal.Y", "half1.normal.Z"] {
+            planes
+                .get_mut(name)
+                .expect("there")
+                .iter_mut()
+                .for_each(|x| *x *= 1.2);
+        }
+    });
+    scaled.has("normal is not the mean of its half buffers", "bad");
+    // The variance of the samples, not of their mean.
+    let samples = damaged(&|planes| {
+        for name in ["variance.R", "variance.G", "variance.B"] {
+            planes
+                .get_mut(name)
+                .expect("there")
+                .iter_mut()
+                .for_each(|x| *x *= 4.0);
+        }
+    });
+    assert!(
+        samples
+            .has("variance of color does not fit", "bad")
+            .starts_with("4.0")
+    );
+    let negative = damaged(&|planes| planes.get_mut("variance.R").expect("there")[5] = -1.0);
+    negative.has("variance of color is negative", "bad");
+    let invalid = damaged(&|planes| planes.get_mut("depth.Z").expect("there")[5] = f32::NAN);
+    assert!(
+        invalid
+            .has("depth: NaN or infinite samples", "bad")
+            .starts_with("1;")
+    );
+    let dark = damaged(&|planes| planes.get_mut("specular.R").expect("there").fill(0.0));
+    dark.has(
+        "color is not the sum of its diffuse and specular part",
+        "bad",
+    );
+    let cleaned = damaged(&|planes| planes.get_mut("ref.diffuse.R").expect("there").fill(0.0));
+    cleaned.has(
+        "reference is not the sum of its diffuse and specular part",
+        "bad",
+    );
+}

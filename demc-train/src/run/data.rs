@@ -9,6 +9,7 @@ use anyhow::{Context, ensure};
 use demc_data::check::content;
 use demc_data::image::exr::ExrFile;
 use demc_data::image::frame::{FramePlanes, Presence};
+use demc_data::image::layout::Passes;
 use demc_data::{
     BatchLoader, ChannelLayout, DataConfig, Dataset, Dropout, Normalizer, PatchSource, Ranges,
     Scene, Split, Statistics,
@@ -123,7 +124,9 @@ impl TrainingData {
             stride,
             ..
         } = &config.data;
-        let layout = ChannelLayout::resolve(layout)?;
+        let mut layout = ChannelLayout::resolve(layout)?;
+        // No network of this program reads them, so weights and run records do not name them.
+        layout.passes = Passes::default();
         let dataset = Dataset::open(root, &layout)?;
         let (train, validation) = dataset.train_validation(*validation, config.train.seed)?;
         let test: Vec<Scene> = dataset

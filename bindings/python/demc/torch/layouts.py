@@ -1,6 +1,7 @@
 """Layouts: which channels of a renderer's file hold colour, features, and reference. No PyTorch.
 
-The rules are those of `demc-infer`. The presets are the files of `configs/renderers`.
+The rules are those of `demc-infer`. The presets are the files of `configs/renderers`. Passes of the paper's
+comparison are not read here.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Layout:
     @classmethod
     def from_table(cls, name: str, table: Mapping) -> Layout:
         """A layout from parsed TOML or JSON. Raises ValueError with all its mistakes."""
-        known = ("color", *BUFFERS, "reference", "mask", "alpha", "alternatives", "missing")
+        known = ("color", *BUFFERS, "reference", "mask", "alpha", "passes", "alternatives", "missing")
         problems = [f"unknown key {key}" for key in table if key not in known]
         channels, given = {}, table.get("missing", {})
         for buffer in ("color", *BUFFERS, "reference"):
@@ -65,6 +66,8 @@ class Layout:
                 problems.append(f"alternatives.{buffer} needs {buffer}, the names that come first")
             else:
                 alternatives[buffer] = tuple(map(tuple, triples))
+        if not isinstance(table.get("passes", {}), Mapping):
+            problems.append("passes: expected a table")
         if not isinstance(given, Mapping):
             problems.append("missing: expected a table")
             given = {}

@@ -1,6 +1,9 @@
 //! What the checks find, and problems as they are reported.
 
+use demc_program::file::FileError;
 use serde::Serialize;
+
+use crate::error::Error;
 
 /// The scenes that share a problem.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -51,6 +54,34 @@ impl Finding {
                 detail,
             },
         }
+    }
+}
+
+/// The message without the path, which the scene's name replaces.
+pub(super) fn short(error: &Error) -> String {
+    match error {
+        Error::MissingChannels { missing, .. } => missing.join(", "),
+        Error::Sizes {
+            a,
+            a_window,
+            b,
+            b_window,
+            ..
+        } => format!("{a} is {a_window}, {b} is {b_window}"),
+        Error::NonFinite {
+            channel,
+            value,
+            x,
+            y,
+            count,
+            ..
+        } => format!("{channel}: {count}, the first {value} at x {x}, y {y}"),
+        Error::SceneSize {
+            found, expected, ..
+        } => format!("{found}, not {expected}"),
+        Error::Exr { detail, .. } | Error::Layout { detail, .. } => detail.clone(),
+        Error::File(FileError::Read { source, .. }) => source.to_string(),
+        other => other.to_string(),
     }
 }
 

@@ -1,12 +1,13 @@
 //! Looks for mistakes in a data set that training would not report: it only gets worse.
 //!
 //! [`examine`] reads every scene once. [`scene`](self) checks a file and its features, `reference`
-//! compares noisy image and reference, `set` compares scenes with each other. All limits were set on
+//! compares noisy image and reference, `passes` checks half buffers, variances, and parts, `set` compares scenes with each other. All limits were set on
 //! the 108 scenes of the training and test renders, none of which has a finding.
 
 mod alignment;
 mod details;
 mod finding;
+mod passes;
 mod reference;
 mod scene;
 mod set;

@@ -3,7 +3,8 @@
 use demc_program::file::FileError;
 
 use super::alignment;
-use super::finding::Finding;
+use super::finding::{Finding, short};
+use super::passes;
 use super::reference;
 use super::set::Image;
 use crate::check::geometry;
@@ -93,6 +94,7 @@ pub(super) fn examine(
         ));
     }
     findings.extend(wrong);
+    findings.extend(passes::findings(&scene.name, &scene.path, layout));
     let image = Image::of(&frame);
     (findings, Some(image))
 }
@@ -119,34 +121,6 @@ fn unusable(scene: &Scene, error: &Error) -> Finding {
         _ => ("files cannot be read", "copy or render them again"),
     };
     Finding::new(problem, cause, &scene.name, short(error))
-}
-
-/// The message without the path, which the scene's name replaces.
-fn short(error: &Error) -> String {
-    match error {
-        Error::MissingChannels { missing, .. } => missing.join(", "),
-        Error::Sizes {
-            a,
-            a_window,
-            b,
-            b_window,
-            ..
-        } => format!("{a} is {a_window}, {b} is {b_window}"),
-        Error::NonFinite {
-            channel,
-            value,
-            x,
-            y,
-            count,
-            ..
-        } => format!("{channel}: {count}, the first {value} at x {x}, y {y}"),
-        Error::SceneSize {
-            found, expected, ..
-        } => format!("{found}, not {expected}"),
-        Error::Exr { detail, .. } | Error::Layout { detail, .. } => detail.clone(),
-        Error::File(FileError::Read { source, .. }) => source.to_string(),
-        other => other.to_string(),
-    }
 }
 
 /// Constant, swapped, packed, and rotated features.

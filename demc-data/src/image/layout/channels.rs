@@ -7,6 +7,7 @@ use demc_program::file::{FileError, MAX_CONFIGURATION, read_text};
 use demc_program::message::printable;
 use serde::{Deserialize, Serialize};
 
+use super::passes::{NamedBuffer, Passes, Triple};
 use crate::error::Error;
 
 /// The start of a name that stands for any view layer, the same one in all names of a layout.
@@ -40,9 +41,6 @@ pub const PRESETS: [(&str, &str); 6] = [
     ),
 ];
 
-/// The names of a buffer's three channels, in the order xyz or RGB.
-pub type Triple = [String; 3];
-
 /// The channel names of a renderer's files.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -71,6 +69,9 @@ pub struct ChannelLayout {
     /// Alpha of the colour, 0 to 1, which is denoised with it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub alpha: Option<String>,
+    /// Names of the passes of the paper's comparison.
+    #[serde(default, skip_serializing_if = "Passes::is_empty")]
+    pub passes: Passes,
     /// Other names of feature buffers, for files that lack the names above.
     #[serde(default, skip_serializing_if = "Alternatives::is_empty")]
     pub alternatives: Alternatives,
@@ -224,6 +225,33 @@ impl ChannelLayout {
         ]
     }
 
+    /// All buffers that the layout names, passes included.
+    pub fn buffers(&self) -> Vec<NamedBuffer> {
+        let buffer = |content: &str, names: &[String]| NamedBuffer {
+            content: content.to_owned(),
+            channels: names.to_vec(),
+        };
+        let features = self.features();
+        let triples = [("color", Some(&self.color))]
+            .into_iter()
+            .chain(features.map(|buffer| (buffer.name, buffer.channels)))
+            .chain([("reference", self.reference.as_ref())])
+            .chain(self.passes.parts());
+        let singles = [
+            ("mask", &self.mask),
+            ("alpha", &self.alpha),
+            ("depth", &self.passes.depth),
+        ];
+        let triples =
+            triples.filter_map(|(content, names)| names.map(|names| buffer(content, &names[..])));
+        let singles = singles.into_iter().filter_map(|(content, name)| {
+            Some(buffer(content, std::slice::from_ref(name.as_ref()?)))
+        });
+        let mut buffers: Vec<NamedBuffer> = triples.chain(singles).collect();
+        buffers.extend(self.passes.derived(&buffers));
+        buffers
+    }
+
     /// All problems of this layout, one phrase each.
     pub fn validate(&self) -> Vec<String> {
         let mut problems = Vec::new();
@@ -255,15 +283,11 @@ impl ChannelLayout {
             }
         }
         let mut seen = HashSet::new();
-        let all = features
+        let buffers = self.buffers();
+        let all = buffers
             .iter()
-            .filter_map(|feature| feature.channels)
-            .chain([&self.color])
-            .chain(&self.reference)
-            .chain(self.alternatives.in_order().into_iter().flatten())
-            .flatten()
-            .chain(&self.mask)
-            .chain(&self.alpha);
+            .flat_map(|buffer| &buffer.channels)
+            .chain(self.alternatives.in_order().into_iter().flatten().flatten());
         for name in all {
             if !seen.insert(name) {
                 problems.push(format!("channel {name:?} is named twice"));

@@ -5,9 +5,8 @@ use std::io::{Read, Seek};
 
 use demc_program::message::list;
 
-use super::channels::{
-    ANY_LAYER, Alternatives, ChannelLayout, Missing, MissingPolicies, PRESETS, Triple,
-};
+use super::channels::{ANY_LAYER, Alternatives, ChannelLayout, Missing, MissingPolicies, PRESETS};
+use super::passes::Triple;
 use crate::error::Error;
 use crate::image::exr::ExrFile;
 
@@ -106,6 +105,7 @@ impl ChannelLayout {
             .flatten()
             .chain(&mut self.mask)
             .chain(&mut self.alpha)
+            .chain(self.passes.names_mut())
     }
 
     fn has_any_layer(&self) -> bool {
@@ -316,7 +316,7 @@ fn found_and_lacking<R: Read + Seek>(
     (found, lacking)
 }
 
-/// The layout without the feature buffers that the file lacks, with `missing` for these.
+/// The layout without the feature buffers and passes that the file lacks, with `missing` for these.
 fn without_absent<R: Read + Seek>(
     file: &ExrFile<R>,
     mut layout: ChannelLayout,
@@ -331,6 +331,7 @@ fn without_absent<R: Read + Seek>(
     ] {
         names.take_if(is_absent);
     }
+    layout.passes.forget_absent(file, &layout.color[0]);
     layout.missing = missing;
     layout
 }

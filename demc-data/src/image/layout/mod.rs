@@ -13,17 +13,22 @@
 //! [alternatives]              # other names, for files without the names above
 //! normal = [["nn.X", "nn.Y", "nn.Z"]]
 //!
+//! [passes]                    # for NFOR and KPCN only
+//! depth = "depth.Z"
+//! half_buffers = ["half1.", "half2."]
+//!
 //! [missing]                   # "error" (default) or "zeros"; for texture2 also "copy-texture1"
 //! texture2 = "copy-texture1"
 //! ```
 
 mod channels;
 mod detect;
+mod passes;
 #[cfg(test)]
 mod tests;
 
 pub use channels::{
     ANY_LAYER, Alternatives, ChannelLayout, FeatureBuffer, Missing, MissingPolicies, PRESETS,
-    Triple,
 };
 pub use detect::{FileLayout, detect};
+pub use passes::{NamedBuffer, Passes, Triple};

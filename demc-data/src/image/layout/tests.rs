@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::channels::*;
 use super::detect::*;
+use super::passes::Triple;
 use crate::image::exr::ExrFile;
 
 const MINIMAL: &str = r#"
@@ -303,4 +304,45 @@ fn one_part_per_pass_is_read_like_one_part() {
     let found = detect(&file, MissingPolicies::default(), None).expect("cycles");
     assert_eq!(found.layer.as_deref(), Some("ViewLayer"));
     assert_eq!(found.layout.missing.texture2, Missing::CopyTexture1);
+}
+
+#[test]
+fn half_buffers_and_variances_are_named_by_their_start() {
+    let layout = ChannelLayout::resolve("demc-exr").expect("a preset");
+    let channels = |content: &str| {
+        let buffers = layout.buffers();
+        let found = buffers.iter().find(|buffer| buffer.content == content);
+        found
+            .unwrap_or_else(|| panic!("{content}: {buffers:?}"))
+            .channels
+            .clone()
+    };
+    assert_eq!(
+        channels("half buffer 2 of color"),
+        ["half2.R", "half2.G", "half2.B"]
+    );
+    assert_eq!(channels("half buffer 1 of depth"), ["half1.depth.Z"]);
+    assert_eq!(channels("variance of texture1")[1], "variance.albedo1.G");
+    assert_eq!(channels("variance of specular")[2], "variance.specular.B");
+    assert_eq!(channels("reference_diffuse")[0], "ref.diffuse.R");
+    // color, 4 features, reference, 4 parts, mask, depth, 2 * 4 half buffers, and 6 variances.
+    assert_eq!(layout.buffers().len(), 26);
+}
+
+#[test]
+fn a_pass_may_have_no_name_of_another_buffer() {
+    let passes = "[passes]\ndepth = \"R\"\nhalf_buffers = [\"a.\", \"a.\"]\n";
+    let text = message(&format!(
+        "{MINIMAL}\nmissing.texture2 = \"zeros\"\n{passes}"
+    ));
+    for words in [
+        "channel \"R\" is named twice",
+        "channel \"a.n.X\" is named twice",
+    ] {
+        assert!(text.contains(words), "{words}: {text}");
+    }
+    let text = message(&format!(
+        "{MINIMAL}\nmissing.texture2 = \"zeros\"\n[passes]\ndeep = 1\n"
+    ));
+    assert!(text.contains("unknown field `deep`"), "{text}");
 }
