@@ -183,7 +183,7 @@ impl Scenes {
             || ImageScore::full(frame, &denoised, &others, residual),
             || process(&scene_images),
         );
-        Ok((score?, processed?))
+        Ok((score?.with_base(&scene.base), processed?))
     }
 
     fn read_scene(

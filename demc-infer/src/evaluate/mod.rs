@@ -9,6 +9,6 @@ mod difference;
 mod score;
 mod table;
 
-pub use difference::{Difference, FEW_IMAGES};
+pub use difference::Difference;
 pub use score::{FailedImage, ImageScore, MeanScore, Report, Score, score};
 pub(crate) use score::{image_of, reference_of};

@@ -94,6 +94,9 @@ pub(super) fn is_headline(name: &str) -> bool {
 pub struct ImageScore {
     /// The image.
     pub name: String,
+    /// Its base scene in the data set; `None` for an image of its own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub base: Option<String>,
     /// Score of the input.
     pub noisy: Score,
     /// Score of an all-zero image.
@@ -155,12 +158,25 @@ impl ImageScore {
             .map(|(name, planes)| Ok(((*name).to_owned(), score(name, planes)?)));
         Ok(Self {
             name: frame.name.clone(),
+            base: None,
             noisy: score("noisy image", &frame.color)?,
             black: score("black image", &zeros)?,
             denoised: score("denoised image", denoised)?,
             baselines: baselines.collect::<Result<_, DenoiseError>>()?,
             reference_residual,
         })
+    }
+
+    /// The score of a view of the base scene `base`.
+    #[must_use]
+    pub fn with_base(self, base: &str) -> Self {
+        let base = Some(base.to_owned());
+        Self { base, ..self }
+    }
+
+    /// The base scene: images with the same one count as one value in comparisons.
+    pub fn base_scene(&self) -> &str {
+        self.base.as_ref().unwrap_or(&self.name)
     }
 
     /// All scores by name: `noisy`, `black`, the baselines, `denoised`.
@@ -297,6 +313,7 @@ pub(super) mod tests {
         };
         ImageScore {
             name: name.into(),
+            base: None,
             noisy: score.clone(),
             black: score.clone(),
             denoised: score,

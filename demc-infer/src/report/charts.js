@@ -3,10 +3,11 @@
   const against = [...new Set(data.differences.map((difference) => difference.against))];
   const words = (difference) => {
     const better = cost(metricsByName.get(difference.metric), 1) > 0 ? difference.mean < 0 : difference.mean > 0;
-    return difference.significant ? (better ? "better" : "worse") : "not significant";
+    return difference.claimed ? (better ? "better" : "worse") : "not shown";
   };
+  const change = (difference, value) => difference.scale === "ratio" ? `${value < 0 ? "" : "+"}${(100 * value).toFixed(1)} %` : number(value, true);
   function sentence(name, rows) {
-    const parts = [["better", "Better than"], ["worse", "Worse than"], ["not significant", "No significant difference from"]].flatMap(([word, phrase]) => {
+    const parts = [["better", "Better than"], ["worse", "Worse than"], ["not shown", "No difference shown from"]].flatMap(([word, phrase]) => {
       const metrics = rows.filter((row) => words(row) === word).map((row) => row.metric);
       return metrics.length ? `${phrase} ${name} in ${metrics.join(", ")}.` : [];
     });
@@ -26,19 +27,19 @@
   }
   for (const name of against) {
     const rows = data.differences.filter((difference) => difference.against === name);
-    const head = ["metric", "difference", "95 % interval", "better ← → worse", "result"].map((text, i) => make("th", { scope: "col", text, ...(i > 2 ? { style: i === 3 ? "text-align:center" : "text-align:left" } : {}) }));
-    byId("difference-tables").append(make("div", {}, make("h3", { text: `denoised against ${name}, ${rows[0].images} images` }),
+    const head = ["metric", "change", "95 % interval", "better ← → worse", "result"].map((text, i) => make("th", { scope: "col", text, ...(i > 2 ? { style: i === 3 ? "text-align:center" : "text-align:left" } : {}) }));
+    byId("difference-tables").append(make("div", {}, make("h3", { text: `denoised against ${name}, ${rows[0].images} images of ${rows[0].bases} base scenes` }),
       make("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `differences from ${name}` }, make("table", {}, make("thead", {}, make("tr", {}, ...head)),
         make("tbody", {}, ...rows.map((difference) => make("tr", { title: difference.verdict },
           make("th", { scope: "row", text: difference.metric === "energy-bias" ? "|energy-bias|" : difference.metric }),
-          make("td", { text: number(difference.mean, true) }),
-          make("td", { text: difference.interval.map((end) => number(end, true)).join(" to ") }),
+          make("td", { text: change(difference, difference.mean) }),
+          make("td", { text: difference.interval.map((end) => change(difference, end)).join(" to ") }),
           make("td", { class: "plot" }, plot(difference)),
           make("td", { class: { better: "better-word", worse: "worse-word" }[words(difference)] ?? "none", text: words(difference) })))))),
       make("p", { class: "note", text: sentence(name, rows) })));
   }
   if (!against.length) byId("differences").hidden = true;
-  if (data.images.length < data.fewImages) byId("few").textContent = `Intervals from ${data.images.length} images are too narrow: a difference marked significant may not be.`;
+  if (data.differences.some((difference) => difference.bases < data.fewestBases)) byId("few").textContent = `Fewer than ${data.fewestBases} base scenes cannot show a difference.`;
 
   // Histograms: one row per method on a common axis.
   const BINS = 22, WIDTH = 260, ROW = 24, LEFT = 58;

@@ -12,7 +12,8 @@ use demc_model::metrics::METRICS;
 use serde::Serialize;
 use serde_json::json;
 
-use crate::evaluate::{FEW_IMAGES, ImageScore, Report};
+use crate::evaluate::{ImageScore, Report};
+use crate::statistics::FEWEST_BASES;
 pub use views::{EncodedScene, ReportError, SceneImages};
 
 const TEMPLATE: &str = include_str!("page.html");
@@ -85,7 +86,7 @@ impl ReportPage {
             "failed": report.failed,
             "mean": by_name(&methods)?,
             "differences": report.differences(),
-            "fewImages": FEW_IMAGES,
+            "fewestBases": FEWEST_BASES,
             "curve": { "white": codec::WHITE, "toe": codec::TOE },
             "errorScale": error_map::SCALE,
         });

@@ -83,17 +83,21 @@ fn baselines_are_scored_beside_the_model_and_compared_with_it() {
             .expect("a difference")
     };
     let found = of("perfect", "relmse");
-    assert_eq!(found["mean"], json["mean"]["denoised"]["relmse"]);
+    assert_eq!(found["scale"], "ratio");
+    assert!(found["mean"].as_f64().expect("number") > 100.0);
+    // Four base scenes: the sign-flip test cannot claim a difference.
     assert_eq!(
-        (&found["images"], &found["significant"]),
-        (&4.into(), &true.into())
+        (&found["images"], &found["bases"], &found["claimed"]),
+        (&4.into(), &4.into(), &false.into())
     );
+    assert_eq!(found["p_sign_flip"], 0.125);
     assert!(differences.iter().all(|d| d["against"] != "noisy"));
     for words in [
         "smape noisy",
         "bright",
-        "denoised against perfect, 4 images: worse in relmse (+",
-        "worse in smape",
+        "denoised against perfect, 4 images of 4 base scenes: no difference shown in relmse (+",
+        "no difference shown in smape",
+        "fewer than 6 base scenes cannot show a difference",
     ] {
         assert!(
             outcome.stdout.contains(words),

@@ -7,21 +7,27 @@ use crate::ranks::Reduce;
 use crate::record::progress::say;
 use crate::run::signals::Outcome;
 use crate::tools::ablation;
+use crate::tools::ablation::comparison::Comparison;
 use crate::tools::ablation::spec::AblationSpec;
 use clap::Args;
+use demc_program::message::printable;
 
 use super::compute::{ComputeArguments, report_stop};
 
 /// Train variants with several seeds each and compare them on the test split
 ///
 /// The file names a base configuration, seeds and variants (see configs/ablation.toml). Rerun the
-/// command to resume an ablation: complete runs are not repeated. Writes ablation.md, .csv and
-/// .json to the directory of the ablation.
+/// command to resume an ablation: complete runs are not repeated. Writes results.csv, and
+/// ablation.md, .json and .svg, to the directory of the ablation.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// File of the ablation
-    #[arg(short, long, value_name = "FILE")]
-    config: PathBuf,
+    #[arg(short, long, value_name = "FILE", required_unless_present = "results")]
+    config: Option<PathBuf>,
+
+    /// Train nothing: make the tables and the figure beside FILE, a results.csv, again
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["config", "run_dir", "set"])]
+    results: Option<PathBuf>,
 
     /// Directory of the runs and the results, instead of dir in the file
     #[arg(short, long, value_name = "DIR")]
@@ -37,7 +43,13 @@ pub struct Arguments {
 
 /// Trains and compares the variants.
 pub fn run(arguments: Arguments, reduce: &Reduce) -> anyhow::Result<u8> {
-    let spec = AblationSpec::load(&arguments.config, &arguments.set);
+    if let Some(results) = arguments.results {
+        let (comparison, paths) = ablation::remake(&results)?;
+        report(&comparison, paths);
+        return Ok(0);
+    }
+    let config = arguments.config.expect("required without results");
+    let spec = AblationSpec::load(&config, &arguments.set);
     let mut spec = reduce.agree(spec.map_err(Into::into))?;
     if let Some(dir) = arguments.run_dir {
         spec.dir = utf8("--run-dir", &dir)?.into();
@@ -60,11 +72,15 @@ pub fn run(arguments: Arguments, reduce: &Reduce) -> anyhow::Result<u8> {
         Outcome::Complete(None) => Ok(0),
         Outcome::Complete(Some(comparison)) => {
             let paths = ablation::write(&comparison, &spec.dir)?;
-            say(format!("\n{}", ablation::markdown(&comparison)));
-            for path in paths {
-                say(path.display());
-            }
+            report(&comparison, paths);
             Ok(0)
         }
+    }
+}
+
+fn report(comparison: &Comparison, paths: [PathBuf; 3]) {
+    say(format!("\n{}", ablation::markdown(comparison)));
+    for path in paths {
+        say(printable(&path.display().to_string()));
     }
 }

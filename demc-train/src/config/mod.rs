@@ -21,6 +21,7 @@ use demc_data::DataConfig;
 use demc_infer::Bundled;
 use demc_model::kernel_head::GAMMA;
 use demc_model::{Head, LossConfig, ModelConfig, Variant};
+use demc_program::checksum::sha256;
 use demc_program::file::{MAX_CONFIGURATION, read_text};
 use demc_program::message::printable;
 use serde::{Deserialize, Serialize};
@@ -32,6 +33,9 @@ pub use optimizer::{OptimizerConfig, OptimizerKind};
 pub use run::RunConfig;
 pub(crate) use source::one_line;
 pub use train::{OnNan, TrainConfig};
+
+/// Number of hexadecimal digits of [`Config::hash`].
+pub const HASH_DIGITS: usize = 16;
 
 /// The configuration of a run, one field per table.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -238,6 +242,33 @@ impl Config {
         (self.data.batch_size * self.train.grad_accumulation) as u64
     }
 
+    /// The first 16 digits of the SHA-256 of the keys that change numbers of the run; see
+    /// [`differences`](Self::differences).
+    pub fn hash(&self) -> String {
+        let keys = self.relevant();
+        let text = keys.iter().map(|(key, value)| format!("{key} = {value}\n"));
+        let mut digits = sha256([text.collect::<String>().as_bytes()]);
+        digits.truncate(HASH_DIGITS);
+        digits
+    }
+
+    /// The keys that change numbers of a run.
+    fn relevant(&self) -> BTreeMap<String, Value> {
+        let mut config = self.clone();
+        let (log_every, validate_every) = (config.run.log_every, config.run.validate_every);
+        config.run = RunConfig {
+            log_every,
+            validate_every,
+            ..RunConfig::default()
+        };
+        config.train.on_nan = OnNan::default();
+        config.data.root = PathBuf::new();
+        config.data.layout = String::new();
+        config.data.workers = DataConfig::default().workers;
+        config.data.cache_mib = DataConfig::default().cache_mib;
+        config.values()
+    }
+
     /// The keys in which a run of `self` differs from one of `other`; empty if one may resume the
     /// other.
     ///
@@ -245,22 +276,7 @@ impl Config {
     /// `on_nan`, threads and memory of the loader. Data root and layout are ignored too, because a
     /// resume compares scenes, statistics and channels themselves.
     pub fn differences(&self, other: &Config) -> Vec<String> {
-        let relevant = |config: &Config| {
-            let mut config = config.clone();
-            let (log_every, validate_every) = (config.run.log_every, config.run.validate_every);
-            config.run = RunConfig {
-                log_every,
-                validate_every,
-                ..RunConfig::default()
-            };
-            config.train.on_nan = OnNan::default();
-            config.data.root = PathBuf::new();
-            config.data.layout = String::new();
-            config.data.workers = DataConfig::default().workers;
-            config.data.cache_mib = DataConfig::default().cache_mib;
-            config.values()
-        };
-        let (ours, theirs) = (relevant(self), relevant(other));
+        let (ours, theirs) = (self.relevant(), other.relevant());
         let keys: BTreeSet<&String> = ours.keys().chain(theirs.keys()).collect();
         let shown = |value: Option<&Value>| value.map_or("absent".into(), source::shown);
         keys.into_iter()

@@ -87,6 +87,7 @@ fn score_scene(bundle: &Bundle, scene: &Scene, draws: bool) -> anyhow::Result<Sc
     Ok(SceneResult {
         score: ImageScore {
             name: scene.name.clone(),
+            base: Some(scene.base.clone()),
             ..ImageScore::new(&frame, &denoised, scene.ref_residual_relmse)?
         },
         dark,

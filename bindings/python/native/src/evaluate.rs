@@ -99,5 +99,5 @@ fn score_scene(
     frame.name.clone_from(&scene.name);
     let denoised = bundle.denoise_with(&frame, options, unobserved)?.color_hdr;
     let residual = scene.ref_residual_relmse;
-    Ok(ImageScore::full(&frame, &denoised, &[], residual)?)
+    Ok(ImageScore::full(&frame, &denoised, &[], residual)?.with_base(&scene.base))
 }

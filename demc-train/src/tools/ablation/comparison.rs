@@ -1,20 +1,23 @@
 //! The scores of all runs, summarised in one row per variant.
 
-use anyhow::ensure;
-use demc_infer::evaluate::{ImageScore, Report, Score};
-use demc_infer::statistics::Estimate;
-use demc_model::metrics::Better;
+use std::collections::BTreeSet;
+
+use anyhow::{Context, ensure};
+use demc_infer::statistics::{Average, Estimate, holm};
+use demc_model::metrics::{Better, METRICS, Metric};
 use serde::{Deserialize, Serialize};
 
-use super::spec::AblationSpec;
+use super::results::ScoredRun;
 
 /// A comparison of variants on the images of the test split.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Comparison {
-    /// The seeds.
+    /// The seeds from which every variant was trained.
     pub seeds: Vec<u64>,
     /// The images.
     pub images: Vec<String>,
+    /// The base scene of each image.
+    pub bases: Vec<String>,
     /// One row per variant, the reference first.
     pub rows: Vec<VariantScores>,
     /// Keys outside `[model]` in which the variants differ.
@@ -32,93 +35,100 @@ pub struct VariantScores {
     pub parameters: u64,
     /// Floating-point operations of a forward pass per pixel.
     pub flops_per_pixel: f64,
-    /// Mean training time of a run, seconds.
-    pub seconds: f64,
-    /// RelMSE over images and seeds.
-    pub relmse: Estimate,
-    /// SSIM over the images that have one, and seeds.
-    pub ssim: Option<Estimate>,
-    /// RelMSE minus that of the first variant, paired by image and seed; `None` for the first.
-    pub relmse_difference: Option<Estimate>,
-    /// SSIM minus that of the first variant.
-    pub ssim_difference: Option<Estimate>,
-    /// Mean RelMSE of each seed.
-    pub relmse_of_seeds: Vec<f64>,
-    /// Mean SSIM of each seed.
-    pub ssim_of_seeds: Vec<f64>,
+    /// Mean training time of a run, minutes.
+    pub minutes: f64,
+    /// RelMSE.
+    pub relmse: MetricScores,
+    /// SSIM over the images that have one.
+    pub ssim: Option<MetricScores>,
 }
 
-/// A complete run.
-#[derive(Clone, Debug)]
-pub struct FinishedRun {
-    /// Scores of the test split.
-    pub report: Report,
-    /// Training time, seconds.
-    pub seconds: f64,
+/// The scores of a variant in one metric.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MetricScores {
+    /// The mean.
+    #[serde(flatten)]
+    pub average: Average,
+    /// The change from the first variant to this one; `None` for the first, and for fewer than two
+    /// base scenes.
+    pub change: Option<Estimate>,
 }
 
-type ScoreTable = Vec<Vec<f64>>;
+/// The values of a metric: `values[variant][seed][image]`, for the images that have one.
+struct MetricTable<'a> {
+    values: Vec<Vec<Vec<f64>>>,
+    bases: Vec<&'a str>,
+}
 
 impl Comparison {
-    /// Compares complete runs, `runs[variant][seed]`.
+    /// Compares runs. The first run is of the reference. Only seeds count from which every variant
+    /// was trained.
     ///
     /// # Errors
-    /// Runs without scores, or with scores on different images.
-    pub fn new(spec: &AblationSpec, runs: &[Vec<FinishedRun>]) -> anyhow::Result<Self> {
-        let names = |run: &FinishedRun| -> Vec<String> {
-            run.report
-                .images
-                .iter()
-                .map(|image| image.name.clone())
-                .collect()
-        };
-        let images = runs
-            .first()
-            .and_then(|runs| runs.first())
-            .map(names)
-            .unwrap_or_default();
-        ensure!(
-            !images.is_empty(),
-            "{}: no scores to compare",
-            spec.dir.display()
-        );
-        for (variant, runs) in spec.variants.iter().zip(runs) {
-            ensure!(
-                runs.iter().all(|run| names(run) == images),
-                "{}: scored on different images than {}",
-                variant.name,
-                spec.variants[0].name
-            );
+    /// No such seed; two runs of the same variant and seed; scores of different images.
+    pub fn new(runs: &[ScoredRun]) -> anyhow::Result<Self> {
+        let first = runs.first().context("no scores to compare")?;
+        let mut variants: Vec<&str> = Vec::new();
+        for run in runs {
+            if !variants.contains(&&*run.variant) {
+                variants.push(&run.variant);
+            }
         }
-        let tables: Vec<[ScoreTable; 2]> = runs.iter().map(|runs| tables(runs)).collect();
-        let rows = spec.variants.iter().zip(runs).zip(&tables).enumerate().map(
-            |(i, ((variant, runs), [relmse, ssim]))| {
-                let [first_relmse, first_ssim] = &tables[0];
-                let difference = |a: &ScoreTable, b: &ScoreTable| {
-                    (i > 0).then(|| Estimate::of_difference(a, b)).flatten()
-                };
-                let model = variant.config.model;
-                VariantScores {
-                    name: variant.name.clone(),
-                    width: model.width,
-                    parameters: model.parameter_count(),
-                    flops_per_pixel: model.flops_per_pixel(),
-                    seconds: mean(runs.iter().map(|run| run.seconds)),
-                    relmse: Estimate::of(relmse).expect("there are images"),
-                    ssim: Estimate::of(ssim),
-                    relmse_difference: difference(relmse, first_relmse),
-                    ssim_difference: difference(ssim, first_ssim),
-                    relmse_of_seeds: relmse.iter().map(|row| mean(row.iter().copied())).collect(),
-                    ssim_of_seeds: ssim.iter().map(|row| mean(row.iter().copied())).collect(),
-                }
-            },
+        let seeds_of = |variant: &str| -> BTreeSet<u64> {
+            let runs = runs.iter().filter(|run| run.variant == variant);
+            runs.map(|run| run.seed).collect()
+        };
+        let common = variants.iter().map(|variant| seeds_of(variant));
+        let seeds = common.reduce(|a, b| &a & &b).unwrap_or_default();
+        ensure!(
+            !seeds.is_empty(),
+            "no seed from which every variant was trained"
         );
+        let runs_of = |variant: &&str| -> anyhow::Result<Vec<&ScoredRun>> {
+            let selected = |run: &&ScoredRun| run.variant == *variant && seeds.contains(&run.seed);
+            let mut selected: Vec<_> = runs.iter().filter(selected).collect();
+            selected.sort_by_key(|run| run.seed);
+            ensure!(
+                selected.len() == seeds.len(),
+                "{variant}: two runs of the same seed"
+            );
+            Ok(selected)
+        };
+        let selected: Vec<Vec<&ScoredRun>> =
+            variants.iter().map(runs_of).collect::<Result<_, _>>()?;
+        let relmse = scores(&selected, &METRICS[0])?.context("no RelMSE to compare")?;
+        let ssim = scores(&selected, &METRICS[1])?;
+        let mut ssim = ssim.into_iter().flatten();
+        let rows = selected
+            .iter()
+            .zip(relmse)
+            .map(|(runs, relmse)| VariantScores {
+                name: runs[0].variant.clone(),
+                width: runs[0].width,
+                parameters: runs[0].parameters,
+                flops_per_pixel: runs[0].flops_per_pixel,
+                minutes: runs.iter().map(|run| run.minutes).sum::<f64>() / runs.len() as f64,
+                relmse,
+                ssim: ssim.next(),
+            });
+        let rows = rows.collect();
+        let (images, bases) = images(first, METRICS[0].name).into_iter().unzip();
+        let settings = selected.iter().map(|runs| runs[0]);
+        let differing = settings.filter(|run| !run.settings.is_empty());
         Ok(Comparison {
-            seeds: spec.seeds.clone(),
+            seeds: seeds.into_iter().collect(),
             images,
-            rows: rows.collect(),
-            differences: spec.differences(),
+            bases,
+            rows,
+            differences: differing
+                .map(|run| format!("{}: {}", run.variant, run.settings))
+                .collect(),
         })
+    }
+
+    /// Number of base scenes.
+    pub fn base_count(&self) -> usize {
+        self.bases.iter().collect::<BTreeSet<_>>().len()
     }
 
     /// One sentence for each variant except the first: whether it is better or worse.
@@ -127,39 +137,149 @@ impl Comparison {
             return Vec::new();
         };
         let verdict = |row: &VariantScores| {
-            let relmse = row
-                .relmse_difference
-                .map(|found| found.verdict("RelMSE", Better::Lower));
-            let ssim = row
-                .ssim_difference
-                .map(|found| found.verdict("SSIM", Better::Higher));
-            let words: Vec<String> = [relmse, ssim].into_iter().flatten().collect();
-            format!("{} against {}: {}", row.name, first.name, words.join("; "))
+            let metrics = [
+                ("RelMSE", Better::Lower, Some(&row.relmse)),
+                ("SSIM", Better::Higher, row.ssim.as_ref()),
+            ];
+            let words = metrics.into_iter().filter_map(|(name, better, scores)| {
+                let change = scores?.change.as_ref()?;
+                Some(change.verdict(name, better))
+            });
+            let words: Vec<String> = words.collect();
+            let scope = if self.seeds.len() == 1 {
+                ", for this one seed"
+            } else {
+                ""
+            };
+            let text = format!("{} against {}{scope}: ", row.name, first.name);
+            if words.is_empty() {
+                text + "one base scene gives no interval"
+            } else {
+                text + &words.join("; ")
+            }
         };
         others.iter().map(verdict).collect()
     }
 }
 
-/// RelMSE and SSIM by seed and image; only images with an SSIM count.
-fn tables(runs: &[FinishedRun]) -> [ScoreTable; 2] {
-    let table = |metric: &dyn Fn(&Score) -> Option<f64>| -> ScoreTable {
-        let row = |run: &FinishedRun| {
-            let scores = run
-                .report
-                .images
-                .iter()
-                .map(|image: &ImageScore| metric(&image.denoised));
-            scores.flatten().collect()
-        };
-        runs.iter().map(row).collect()
+/// The scores of each variant in `metric`; `None` if no image has a value.
+///
+/// # Errors
+/// Values of different images.
+fn scores(runs: &[Vec<&ScoredRun>], metric: &Metric) -> anyhow::Result<Option<Vec<MetricScores>>> {
+    let MetricTable { values, bases } = table(runs, metric.name)?;
+    let compare = |ours: &Vec<Vec<f64>>| {
+        let average = Average::of(metric.better, ours, &bases)?;
+        let change = Estimate::compare(metric.better, ours, &values[0], &bases);
+        Some(MetricScores { average, change })
     };
-    [
-        table(&|score| Some(score.relmse)),
-        table(&|score| score.ssim),
-    ]
+    let mut found: Option<Vec<MetricScores>> = values.iter().map(compare).collect();
+    if let Some([first, others @ ..]) = found.as_deref_mut() {
+        first.change = None;
+        holm(others.iter_mut().filter_map(|row| row.change.as_mut()));
+    }
+    Ok(found)
 }
 
-fn mean(values: impl Iterator<Item = f64>) -> f64 {
-    let (count, sum) = values.fold((0.0, 0.0), |(n, sum), value| (n + 1.0, sum + value));
-    sum / count
+/// The values of `metric` by variant, seed, and image.
+///
+/// # Errors
+/// Values of different images.
+fn table<'a>(runs: &[Vec<&'a ScoredRun>], metric: &str) -> anyhow::Result<MetricTable<'a>> {
+    let reference = runs[0][0];
+    let expected = images(reference, metric);
+    let row = |run: &&ScoredRun| -> anyhow::Result<Vec<f64>> {
+        ensure!(
+            images(run, metric) == expected,
+            "{}, seed {}: {metric} of different images than {}, seed {}",
+            run.variant,
+            run.seed,
+            reference.variant,
+            reference.seed
+        );
+        let scores = run.scores.iter().filter(|score| score.metric == metric);
+        Ok(scores.map(|score| score.value).collect())
+    };
+    let values = runs.iter().map(|runs| runs.iter().map(row).collect());
+    let scores = reference.scores.iter();
+    Ok(MetricTable {
+        values: values.collect::<Result<_, _>>()?,
+        bases: scores
+            .filter(|score| score.metric == metric)
+            .map(|score| &*score.base)
+            .collect(),
+    })
+}
+
+/// The images with a value of `metric`, and their base scenes.
+fn images(run: &ScoredRun, metric: &str) -> Vec<(String, String)> {
+    let scores = run.scores.iter().filter(|score| score.metric == metric);
+    scores
+        .map(|score| (score.image.clone(), score.base.clone()))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::results::tests::scored;
+    use super::*;
+
+    const DEMC: [(&str, f64, f64); 3] = [("a1", 1.0, 0.5), ("a2", 4.0, 0.7), ("b1", 8.0, 0.9)];
+
+    fn runs() -> Vec<ScoredRun> {
+        let half = DEMC.map(|(image, relmse, ssim)| (image, relmse / 2.0, ssim + 0.01));
+        vec![
+            scored("DEMC", 1, &DEMC),
+            scored("DEMC", 2, &DEMC),
+            scored("SEMC", 1, &half),
+            scored("SEMC", 2, &half),
+        ]
+    }
+
+    #[test]
+    fn variants_are_compared_by_image_seed_and_base_scene() {
+        let found = Comparison::new(&runs()).unwrap();
+        assert_eq!(
+            (found.seeds.len(), found.images.len(), found.base_count()),
+            (2, 3, 2)
+        );
+        let [demc, semc] = &found.rows[..] else {
+            panic!("{found:?}")
+        };
+        assert!((demc.relmse.average.mean - 4.0).abs() < 1e-12);
+        assert_eq!(demc.relmse.change, None);
+        let change = semc.relmse.change.as_ref().unwrap();
+        assert!((change.mean + 0.5).abs() < 1e-12, "{change:?}");
+        let ssim = semc.ssim.as_ref().unwrap().change.as_ref().unwrap();
+        assert!((ssim.mean - 0.01).abs() < 1e-12, "{ssim:?}");
+        let sentence = &found.verdicts()[0];
+        assert!(
+            sentence.starts_with("SEMC against DEMC: no difference shown in RelMSE (-50.0 %"),
+            "{sentence}"
+        );
+    }
+
+    #[test]
+    fn only_seeds_of_every_variant_count_and_one_is_named() {
+        let found = Comparison::new(&runs()[..3]).unwrap();
+        assert_eq!(found.seeds, [1]);
+        let sentence = &found.verdicts()[0];
+        assert!(
+            sentence.starts_with("SEMC against DEMC, for this one seed: "),
+            "{sentence}"
+        );
+        let error = |runs: &[ScoredRun]| Comparison::new(runs).unwrap_err().to_string();
+        let other_seed = scored("SEMC", 3, &DEMC);
+        let error_of_seed = error(&[runs().remove(0), other_seed]);
+        assert!(error_of_seed.contains("no seed"), "{error_of_seed}");
+        let fewer = scored("SEMC", 1, &DEMC[..2]);
+        let error_of_images = error(&[runs().remove(0), fewer]);
+        assert!(
+            error_of_images.contains("SEMC, seed 1: relmse of different images than DEMC, seed 1"),
+            "{error_of_images}"
+        );
+        let twice = [runs().remove(0), runs().remove(0), runs().remove(2)];
+        assert!(error(&twice).contains("DEMC: two runs of the same seed"));
+        assert!(error(&[]).contains("no scores"));
+    }
 }

@@ -2,20 +2,27 @@
 //! split.
 //!
 //! [`AblationSpec`] describes the comparison. [`run`] trains the runs that are not complete, seed
-//! by seed, so that a stopped ablation has complete seeds. [`Comparison`] summarises the scores in
-//! a table.
+//! by seed, so that a stopped ablation has complete seeds. Each complete run adds its scores to
+//! [`results`]. [`Comparison`] summarises them in a table.
 
 pub mod comparison;
+mod figure;
+pub mod results;
 pub mod spec;
 mod table;
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
+use demc_infer::BundleFile;
+use demc_infer::evaluate::{ImageScore, Report};
+use demc_model::metrics::METRICS;
+use demc_program::checksum::sha256_of;
+use demc_program::message::printable;
 use demc_program::output::{Directories, Outputs};
 
-use crate::config::Config;
+use crate::config::{Config, HASH_DIGITS};
 use crate::record::metrics_log;
 use crate::record::progress::say;
 use crate::run::checkpoint::store::CheckpointStore;
@@ -25,14 +32,28 @@ use crate::run::place::SessionPlace;
 use crate::run::run_dir::SCORES;
 use crate::run::session::{Session, SessionOptions};
 use crate::run::signals::{Outcome, Stopped};
-use comparison::{Comparison, FinishedRun};
+use comparison::Comparison;
+use results::{ImageValue, RESULTS, ScoredRun};
 use spec::AblationSpec;
 
 /// One run of an ablation.
 struct PlannedRun {
     /// `DEMC, seed 1 (2 of 9)`
     name: String,
+    variant: String,
+    /// Keys outside `[model]` in which the variant differs from the first one.
+    settings: String,
     config: Config,
+}
+
+/// The planned runs that are complete and those that are not.
+struct Progress {
+    /// The complete runs, in the order of the table: variant by variant.
+    complete: Vec<ScoredRun>,
+    /// A line about each complete run, in training order.
+    notes: Vec<String>,
+    /// The numbers of the planned runs that are not complete.
+    missing: Vec<usize>,
 }
 
 /// Trains every run of `spec` that is not complete, and compares them. The processes of `place` train
@@ -50,7 +71,9 @@ pub fn run(
     let missing = reduce.from_first(|| {
         check_init(spec)?;
         check_outputs(spec)?;
-        missing(&planned)
+        let progress = collect(spec, &planned)?;
+        progress.notes.iter().for_each(say);
+        Ok(progress.missing)
     })?;
     let divides_steps = |size: usize| {
         let mut variants = spec.variants.iter();
@@ -62,13 +85,25 @@ pub fn run(
             reduce: group.clone(),
             ..place.clone()
         };
-        train(spec, run, &place).with_context(|| run.name.clone())
+        let stopped = train(spec, run, &place).with_context(|| run.name.clone())?;
+        if reduce.is_first() {
+            collect(spec, &planned)?;
+        }
+        Ok(stopped)
     })?;
+    let progress = reduce.is_first().then(|| collect(spec, &planned));
+    let progress = reduce.agree(progress.transpose())?;
     if let Some(stopped) = stopped {
         return Ok(Outcome::Stopped(stopped));
     }
-    let comparison = reduce.is_first().then(|| compared(spec, &planned));
-    let comparison = reduce.agree(comparison.transpose())?;
+    let compared = progress.map(|progress| {
+        if let Some(index) = progress.missing.first() {
+            let dir = planned[*index].config.run_dir().display();
+            bail!("{dir}: no test split to compare on");
+        }
+        Comparison::new(&progress.complete).with_context(|| spec.dir.display().to_string())
+    });
+    let comparison = reduce.agree(compared.transpose())?;
     Ok(Outcome::Complete(comparison.map(Box::new)))
 }
 
@@ -85,25 +120,52 @@ fn planned(spec: &AblationSpec) -> Vec<PlannedRun> {
         .enumerate()
         .map(|(index, (seed, variant))| PlannedRun {
             name: format!("{}, seed {seed} ({} of {total})", variant.name, index + 1),
+            variant: variant.name.clone(),
+            settings: spec.differences_of(variant).join("; "),
             config: spec.run(variant, *seed),
         });
     runs.collect()
 }
 
-/// The numbers of the runs that are not complete.
-fn missing(planned: &[PlannedRun]) -> anyhow::Result<Vec<usize>> {
-    let mut missing = Vec::new();
-    for (index, run) in planned.iter().enumerate() {
-        match finished(&run.config)? {
-            None => missing.push(index),
-            Some(_) => say(format!(
-                "== {}: complete in {}",
-                run.name,
-                run.config.run_dir().display()
-            )),
+/// Looks for complete runs: in their directories, then in `results.csv`, whose rows count if the
+/// configuration is the same. Writes the rows of all complete runs. Rows of other runs stay at the
+/// end of the file.
+fn collect(spec: &AblationSpec, planned: &[PlannedRun]) -> anyhow::Result<Progress> {
+    let path = spec.dir.join(RESULTS);
+    let stored = results::read(&path)?;
+    let mut others = stored.clone();
+    let mut complete: Vec<Option<ScoredRun>> = Vec::new();
+    let mut notes = Vec::new();
+    for run in planned {
+        let is_stored =
+            |row: &ScoredRun| row.variant == run.variant && row.seed == run.config.train.seed;
+        let hash = run.config.hash();
+        let is_same = |row: &&ScoredRun| is_stored(row) && row.configuration == hash;
+        let in_file = || Some((stored.iter().find(is_same)?.clone(), path.as_path()));
+        let in_dir = finished(run)?.map(|found| (found, run.config.run_dir()));
+        let found = in_dir.or_else(in_file);
+        if let Some((_, place)) = &found {
+            notes.push(format!("== {}: complete in {}", run.name, place.display()));
+            others.retain(|row| !is_stored(row));
         }
+        complete.push(found.map(|(run, _)| run));
     }
-    Ok(missing)
+    let missing = (0..planned.len()).filter(|index| complete[*index].is_none());
+    let missing = missing.collect();
+    let variants = spec.variants.len();
+    let numbers = (0..variants).flat_map(|first| (first..planned.len()).step_by(variants));
+    let complete: Vec<ScoredRun> = numbers
+        .filter_map(|number| complete[number].take())
+        .collect();
+    let all = [complete.as_slice(), &others].concat();
+    if all != stored {
+        results::write(&path, &all)?;
+    }
+    Ok(Progress {
+        complete,
+        notes,
+        missing,
+    })
 }
 
 /// Trains a run. Returns the signal if one stopped it.
@@ -141,18 +203,6 @@ fn train(
     }
 }
 
-/// The comparison of complete runs.
-fn compared(spec: &AblationSpec, planned: &[PlannedRun]) -> anyhow::Result<Comparison> {
-    let mut runs = vec![Vec::new(); spec.variants.len()];
-    for (index, run) in planned.iter().enumerate() {
-        let dir = run.config.run_dir();
-        let found = finished(&run.config)?
-            .with_context(|| format!("{}: no test split to compare on", dir.display()))?;
-        runs[index % spec.variants.len()].push(found);
-    }
-    Comparison::new(spec, &runs)
-}
-
 fn check_init(spec: &AblationSpec) -> anyhow::Result<()> {
     for seed in &spec.seeds {
         for variant in &spec.variants {
@@ -170,13 +220,16 @@ fn check_outputs(spec: &AblationSpec) -> anyhow::Result<()> {
     for variant in &spec.variants {
         protect_inputs(&mut outputs, &spec.files, &variant.config)?;
     }
+    outputs.claim(&spec.dir.join(RESULTS), true)?;
     for file in table::files(&spec.dir) {
         outputs.claim(&file, true)?;
     }
     Ok(outputs.prepare(Directories::Create)?)
 }
 
-fn finished(config: &Config) -> anyhow::Result<Option<FinishedRun>> {
+/// The scores of a run whose directory is complete.
+fn finished(run: &PlannedRun) -> anyhow::Result<Option<ScoredRun>> {
+    let config = &run.config;
     let dir = config.run_dir();
     let scores = dir.join(SCORES);
     let last = CheckpointStore::new(dir).has(config.train.steps);
@@ -192,12 +245,59 @@ fn finished(config: &Config) -> anyhow::Result<Option<FinishedRun>> {
         differences.join("; ")
     );
     let text = fs::read_to_string(&scores).with_context(|| scores.display().to_string())?;
-    let report = serde_json::from_str(&text).with_context(|| scores.display().to_string())?;
+    let report: Report =
+        serde_json::from_str(&text).with_context(|| scores.display().to_string())?;
     let seconds = metrics_log::elapsed(&dir.join(metrics_log::METRICS)).unwrap_or(f64::NAN);
-    Ok(Some(FinishedRun { report, seconds }))
+    let mut weights = sha256_of(&BundleFile::read(dir)?.path)?;
+    weights.truncate(HASH_DIGITS);
+    Ok(Some(ScoredRun {
+        variant: run.variant.clone(),
+        seed: config.train.seed,
+        configuration: config.hash(),
+        weights,
+        steps: config.train.steps,
+        minutes: seconds / 60.0,
+        width: config.model.width,
+        parameters: config.model.parameter_count(),
+        flops_per_pixel: config.model.flops_per_pixel(),
+        settings: run.settings.clone(),
+        scores: report.images.iter().flat_map(values).collect(),
+    }))
 }
 
-/// Writes the tables of a comparison into `dir`; returns the paths.
+/// The values of all metrics of an image that have one.
+fn values(image: &ImageScore) -> impl Iterator<Item = ImageValue> {
+    METRICS.iter().filter_map(|metric| {
+        Some(ImageValue {
+            image: image.name.clone(),
+            base: image.base_scene().to_owned(),
+            metric: metric.name.to_owned(),
+            value: image.denoised.get(metric.name)?,
+        })
+    })
+}
+
+/// Compares the runs of the file `results` and writes table, numbers, and figure beside it. Returns
+/// the comparison and the paths.
+///
+/// # Errors
+/// A file without comparable runs; a file that cannot be written.
+pub fn remake(results: &Path) -> anyhow::Result<(Comparison, [PathBuf; 3])> {
+    let dir = results.parent().unwrap_or(Path::new(""));
+    let runs = results::read(results)?;
+    let comparison =
+        Comparison::new(&runs).with_context(|| printable(&results.display().to_string()))?;
+    let mut outputs = Outputs::default();
+    outputs.protect(results, "the results");
+    for file in table::files(dir) {
+        outputs.claim(&file, true)?;
+    }
+    outputs.prepare(Directories::Expect)?;
+    let paths = write(&comparison, dir)?;
+    Ok((comparison, paths))
+}
+
+/// Writes table, numbers, and figure of a comparison into `dir`; returns the paths.
 ///
 /// # Errors
 /// A file that cannot be written.

@@ -134,15 +134,19 @@ impl AblationSpec {
 
     /// Keys outside `[model]` in which the variants differ from the first.
     pub fn differences(&self) -> Vec<String> {
-        let (first, others) = self.variants.split_first().expect("at least two");
-        let differing = others.iter().flat_map(|variant| {
-            let mut same_network = variant.config.clone();
-            same_network.model = first.config.model;
-            let keys = same_network.differences(&first.config);
-            keys.into_iter()
-                .map(|key| format!("{}: {key}", variant.name))
+        let differing = self.variants.iter().flat_map(|variant| {
+            let keys = self.differences_of(variant).into_iter();
+            keys.map(|key| format!("{}: {key}", variant.name))
         });
         differing.collect()
+    }
+
+    /// Keys outside `[model]` in which `variant` differs from the first.
+    pub fn differences_of(&self, variant: &AblationVariant) -> Vec<String> {
+        let first = &self.variants[0].config;
+        let mut same_network = variant.config.clone();
+        same_network.model = first.model;
+        same_network.differences(first)
     }
 }
 
