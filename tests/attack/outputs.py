@@ -83,9 +83,10 @@ def outputs(project):
                trained, ending=".svg", directory=True, overwrite=True),
         Output("plot", "curves.svg", lambda o: ["demc-train", "plot", "run", "-o", o], RUN, ending=".svg",
                overwrite=True),
-        *(Output(f"ablate, {kind}", f"ablation/ablation.{kind}",
+        *(Output(f"ablate, {name}", f"ablation/{name}",
                  lambda o: ["demc-train", "ablate", "--config", "ablation.toml", "--run-dir", o or "."],
-                 [*trained, "ablation.toml"], fixed=True, directory=True) for kind in ("md", "csv", "json")),
+                 [*trained, "ablation.toml"], fixed=True, directory=True)
+          for name in ("ablation.md", "ablation.json", "ablation.svg", "results.csv")),
         Output("train", "fresh/test.json",
                lambda o: ["demc-train", *tiny, "--run-dir", o or ".", "--set", "train.init=model.safetensors"],
                [*trained, *MODEL], fixed=True, directory=True),

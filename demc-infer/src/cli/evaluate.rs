@@ -25,7 +25,7 @@ use crate::evaluate::Difference;
 /// then reported and skipped, and the exit code is 1.
 ///
 /// --baseline adds other programs' images of the same scenes. Differences from them are paired by
-/// image, with 95 % bootstrap intervals.
+/// image, with 95 % intervals over base scenes.
 #[derive(Args)]
 #[command(after_help = "Examples:
   demc-infer evaluate --model runs/quickstart --data data/sample

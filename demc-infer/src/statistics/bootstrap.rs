@@ -2,9 +2,9 @@
 //!
 //! A resample draws seeds and base scenes independently and with replacement, and takes the mean
 //! over their cells. With few seeds, intervals from resamples alone are too narrow: over 2 seeds
-//! their standard deviation is 0.71 of the true one. So no end of an interval is nearer to the mean
-//! than that of the t interval for a sum of two means (Banerjee 1961), whose coverage is at least
-//! the nominal one for normal effects.
+//! their standard deviation is 0.71 of the true one. Therefore no end is nearer to the mean than
+//! that of a t interval for a sum of two means (Banerjee 1961). For normal effects, its coverage is
+//! at least the nominal one.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -221,7 +221,12 @@ impl Estimate {
             } else {
                 "worse"
             };
-            return format!("{word} in {metric} ({found}, p = {:.3})", self.p);
+            let p = if self.p < 0.001 {
+                "p < 0.001".to_owned()
+            } else {
+                format!("p = {:.3}", self.p)
+            };
+            return format!("{word} in {metric} ({found}, {p})");
         }
         let detectable = self.detectable_text();
         let text = format!("no difference shown in {metric} ({found}; detectable: {detectable})");
@@ -297,6 +302,11 @@ mod tests {
         assert_eq!(
             six.verdict("ssim", Better::Higher),
             "better in ssim (+1.0000, 95 % interval +1.0000 to +1.0000, p = 0.031)"
+        );
+        let many = compared(Better::Higher, &[(2.0, 1.0); 12]);
+        assert!(
+            many.verdict("ssim", Better::Higher)
+                .ends_with(", p < 0.001)")
         );
         assert!(
             six.verdict("flip", Better::Lower)

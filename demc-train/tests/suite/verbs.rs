@@ -74,7 +74,7 @@ fn an_ablation_resumes_and_writes_table_and_figure() {
         "| DEMC | 4 | ",
         "| SEMC | 5 | ",
         "| color-only | ",
-        "4 test images of 4 base scenes and 2 seeds (1, 2)",
+        "4 test images of 4 base scenes, 2 seeds (1, 2).",
         "- color-only against DEMC: no difference shown in RelMSE (",
         "Fewer than 6 base scenes cannot show a difference.",
         "the same batches in the same order",

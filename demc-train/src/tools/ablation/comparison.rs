@@ -131,34 +131,33 @@ impl Comparison {
         self.bases.iter().collect::<BTreeSet<_>>().len()
     }
 
-    /// One sentence for each variant except the first: whether it is better or worse.
+    /// A sentence for each variant except the first and each metric: whether it is better or worse.
     pub fn verdicts(&self) -> Vec<String> {
         let Some((first, others)) = self.rows.split_first() else {
             return Vec::new();
         };
-        let verdict = |row: &VariantScores| {
+        let scope = if self.seeds.len() == 1 {
+            ", for this one seed"
+        } else {
+            ""
+        };
+        let verdicts = others.iter().flat_map(|row| {
             let metrics = [
                 ("RelMSE", Better::Lower, Some(&row.relmse)),
                 ("SSIM", Better::Higher, row.ssim.as_ref()),
             ];
-            let words = metrics.into_iter().filter_map(|(name, better, scores)| {
-                let change = scores?.change.as_ref()?;
-                Some(change.verdict(name, better))
-            });
-            let words: Vec<String> = words.collect();
-            let scope = if self.seeds.len() == 1 {
-                ", for this one seed"
-            } else {
-                ""
-            };
-            let text = format!("{} against {}{scope}: ", row.name, first.name);
-            if words.is_empty() {
-                text + "one base scene gives no interval"
-            } else {
-                text + &words.join("; ")
-            }
-        };
-        others.iter().map(verdict).collect()
+            metrics.into_iter().filter_map(|(name, better, scores)| {
+                let verdict = match &scores?.change {
+                    Some(change) => change.verdict(name, better),
+                    None => format!("one base scene gives no interval of {name}"),
+                };
+                Some(format!(
+                    "{} against {}{scope}: {verdict}",
+                    row.name, first.name
+                ))
+            })
+        });
+        verdicts.collect()
     }
 }
 

@@ -6,60 +6,67 @@ use crate::tools::chart::figure::{AxisScale, Figure, LinePanel, Series};
 
 use super::comparison::{Comparison, MetricScores, VariantScores};
 
-const PERCENT: f64 = 100.0;
-
 /// A panel for RelMSE, and one for SSIM if the images have one. A line per variant reaches from the
 /// lower to the upper end of its interval, with points at both and at the mean.
 pub(super) fn figure(comparison: &Comparison) -> Figure {
     let panels = [
-        panel(comparison, "change of RelMSE, %", |row| {
-            Some(row.relmse.clone())
-        }),
-        panel(comparison, "change of SSIM", |row| row.ssim.clone()),
+        panel(comparison, "RelMSE", |row| Some(row.relmse.clone())),
+        panel(comparison, "SSIM", |row| row.ssim.clone()),
     ];
-    let has_lines = |panel: &LinePanel| !panel.series.is_empty();
-    Figure(panels.into_iter().filter(has_lines).collect())
+    Figure(panels.into_iter().flatten().collect())
 }
 
+/// `None` without an interval.
 fn panel(
     comparison: &Comparison,
-    title: &str,
+    metric: &str,
     scores: impl Fn(&VariantScores) -> Option<MetricScores>,
-) -> LinePanel {
-    let rows = comparison.rows.iter().enumerate();
-    let lines = rows.filter_map(|(number, row)| {
-        let change = scores(row)?.change?;
-        Some(Series {
-            name: row.name.clone(),
-            points: points(&change, number as f64),
-            faint: false,
-            color: number,
-        })
+) -> Option<LinePanel> {
+    let changes = comparison
+        .rows
+        .iter()
+        .enumerate()
+        .filter_map(|(number, row)| {
+            let change = scores(row)?.change?;
+            Some((number, row, change))
+        });
+    let changes: Vec<_> = changes.collect();
+    let scale = changes.first()?.2.scale;
+    let first = &comparison.rows[0].name;
+    let (x, equal, x_label) = match scale {
+        Scale::Ratio => (
+            AxisScale::Log,
+            1.0,
+            format!("{metric} / {metric} of {first}"),
+        ),
+        Scale::Difference => (
+            AxisScale::Linear,
+            0.0,
+            format!("{metric} - {metric} of {first}"),
+        ),
+    };
+    let series = changes.iter().map(|(number, row, change)| Series {
+        name: row.name.clone(),
+        points: points(change, equal, *number as f64),
+        faint: false,
+        color: *number,
     });
-    let series = lines.collect();
-    let first = comparison.rows.first();
-    LinePanel {
-        title: title.to_owned(),
-        x_label: format!("{title}, with 95 % interval"),
-        y_label: "row of the table".to_owned(),
-        x: AxisScale::Linear,
+    Some(LinePanel {
+        title: format!("{metric}, 95 % intervals"),
+        x_label,
+        y_label: "variant".to_owned(),
+        x,
         y: AxisScale::Linear,
-        series,
-        marks: first
-            .map(|row| (0.0, row.name.clone()))
-            .into_iter()
-            .collect(),
-    }
+        series: series.collect(),
+        marks: vec![(equal, first.clone())],
+    })
 }
 
-fn points(change: &Estimate, height: f64) -> Vec<(f64, f64)> {
-    let factor = match change.scale {
-        Scale::Ratio => PERCENT,
-        Scale::Difference => 1.0,
-    };
+/// Both ends and the mean, relative to `equal`.
+fn points(change: &Estimate, equal: f64, height: f64) -> Vec<(f64, f64)> {
     let [low, high] = change.interval;
     [low, change.mean, high]
-        .map(|x| (factor * x, height))
+        .map(|x| (equal + x, height))
         .to_vec()
 }
 
@@ -78,16 +85,14 @@ mod tests {
         let [relmse, ssim] = &panels[..] else {
             panic!("{panels:?}")
         };
-        assert_eq!(relmse.marks, [(0.0, "DEMC".to_owned())]);
+        assert_eq!(relmse.marks, [(1.0, "DEMC".to_owned())]);
         let [line] = &relmse.series[..] else {
             panic!("{relmse:?}")
         };
         let change = comparison.rows[1].relmse.change.as_ref().unwrap();
         let xs: Vec<f64> = line.points.iter().map(|point| point.0).collect();
-        assert_eq!(
-            xs,
-            [change.interval[0], change.mean, change.interval[1]].map(|x| 100.0 * x)
-        );
+        let [low, high] = change.interval;
+        assert_eq!(xs, [low, change.mean, high].map(|x| 1.0 + x));
         let (x, y) = ssim.series[0].points[1];
         assert!((x - 0.05).abs() < 1e-12 && y == 1.0, "{x} {y}");
     }

@@ -59,9 +59,12 @@ pub(super) fn markdown(comparison: &Comparison) -> String {
             cells(row.ssim.as_ref()),
         );
     }
-    let _ = writeln!(text, "\n{}\n", explanation(comparison));
-    for verdict in comparison.verdicts() {
-        let _ = writeln!(text, "- {verdict}.");
+    text.push('\n');
+    for line in explanation(comparison)
+        .into_iter()
+        .chain(comparison.verdicts())
+    {
+        let _ = writeln!(text, "- {line}.");
     }
     if comparison.base_count() < FEWEST_BASES {
         let _ = writeln!(
@@ -87,26 +90,33 @@ pub(super) fn markdown(comparison: &Comparison) -> String {
 }
 
 /// What the numbers of the table are.
-fn explanation(comparison: &Comparison) -> String {
+fn explanation(comparison: &Comparison) -> [String; 7] {
     let seeds = &comparison.seeds;
     let listed: Vec<String> = seeds.iter().map(ToString::to_string).collect();
     let over = if seeds.len() == 1 {
-        "base scenes, for this one seed"
+        "base scenes"
     } else {
         "base scenes and seeds"
     };
-    format!(
-        "Geometric means of RelMSE and means of SSIM over {} test images of {} and {} ({}); each base scene counts once. \
-         Changes are paired by image and seed, with 95 % bootstrap intervals over {over} ({RESAMPLES} resamples, BCa, at \
-         least as wide as a t interval). Bold: a claimed difference; bootstrap and sign-flip test agree at 5 % after \
-         Holm's correction over the variants. Detectable: the smallest change that would be found with a probability of \
-         80 % before this correction. RelMSE: Eq. 5, summed over rgb, linear HDR, smaller is better. SSIM: Wang et al. \
-         2004 on clip(x, 0, 1)^(1/2.2), larger is better.",
-        comparison.images.len(),
-        count(comparison.base_count(), "base scene"),
-        count(seeds.len(), "seed"),
-        listed.join(", "),
-    )
+    [
+        format!(
+            "Geometric mean of RelMSE, mean of SSIM: {} test images of {}, {} ({})",
+            comparison.images.len(),
+            count(comparison.base_count(), "base scene"),
+            count(seeds.len(), "seed"),
+            listed.join(", "),
+        ),
+        "Each base scene counts once. Changes are paired by image and seed".into(),
+        format!(
+            "In brackets: 95 % bootstrap interval over {over} ({RESAMPLES} resamples, BCa), no narrower than a t interval"
+        ),
+        "Bold: a claimed difference. Bootstrap and sign-flip test agree at 5 % after Holm's correction"
+            .into(),
+        "Detectable: smallest change that would be found with a probability of 80 %, before this correction"
+            .into(),
+        "RelMSE: Eq. 5, summed over rgb, linear HDR, smaller is better".into(),
+        "SSIM: Wang et al. 2004 on clip(x, 0, 1)^(1/2.2), larger is better".into(),
+    ]
 }
 
 /// ` (+0.3 %)` after a parameter count that differs from that of the first variant.
@@ -172,8 +182,9 @@ mod tests {
             "| DEMC | 16 | 1000 | 125 | 1.5 | 0.2000 | - | - | 0.7000 | - | - |",
             "| SEMC | 16 | 1010 (+1.0 %) |",
             "| **+100.0 %** (+100.0 % to +100.0 %) | 0.0 % | 0.6986 | -0.0014 (",
-            "7 test images of 7 base scenes and 2 seeds (1, 2)",
-            "- SEMC against DEMC: worse in RelMSE (+100.0 %, 95 % interval +100.0 % to +100.0 %, p = 0.016); no difference shown in SSIM",
+            "7 test images of 7 base scenes, 2 seeds (1, 2).",
+            "- SEMC against DEMC: worse in RelMSE (+100.0 %, 95 % interval +100.0 % to +100.0 %, p = 0.016).\n",
+            "- SEMC against DEMC: no difference shown in SSIM (-0.0014",
             "All variants trained on the same batches",
         ] {
             assert!(text.contains(words), "{words}:\n{text}");
