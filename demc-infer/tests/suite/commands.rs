@@ -46,7 +46,14 @@ fn evaluate_prints_a_table_and_writes_the_same_numbers_as_json() {
     for image in images {
         assert_eq!(
             keys(image),
-            ["name", "noisy", "black", "denoised", "reference_residual"]
+            [
+                "name",
+                "base",
+                "noisy",
+                "black",
+                "denoised",
+                "reference_residual"
+            ]
         );
         let metrics = keys(&image["noisy"]);
         assert_eq!(metrics[..2], ["relmse", "ssim"]);
