@@ -176,6 +176,8 @@ pub struct ReadingSpec {
     pub normalised_decoder: bool,
     /// Whether a ReLU follows the skip fusion (the sigma of Eq. 2).
     pub activated_fusion: bool,
+    /// Side of the output convolution's kernel (Fig. 3: 1), unless the head is [`Head::Kernel`].
+    pub head_kernel: usize,
 }
 
 impl Variant {
@@ -223,6 +225,7 @@ impl Reading {
                 skip_after: [2, 2, 2, 2, 2],
                 normalised_decoder: false,
                 activated_fusion: true,
+                head_kernel: 1,
             },
             Reading::Released => &ReadingSpec {
                 name: "released",
@@ -230,6 +233,7 @@ impl Reading {
                 skip_after: [2, 2, 3, 3, 3],
                 normalised_decoder: true,
                 activated_fusion: false,
+                head_kernel: 3,
             },
         }
     }

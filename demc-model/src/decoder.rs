@@ -8,7 +8,7 @@ use burn::nn::conv::{Conv2d, ConvTranspose2d};
 use crate::config::{COLOR_CHANNELS, Head, LEVELS, ModelConfig};
 use crate::init::{GREY_HEAD_SCALE, Init};
 use crate::kernel_head;
-use crate::layers::{conv3x3, deconv4x4, norm, skip_fusion};
+use crate::layers::{conv, deconv4x4, norm, skip_fusion};
 use crate::ops::{Activation, Maps};
 use crate::weights::{Builder, Stage, WeightsError};
 
@@ -17,7 +17,8 @@ use crate::weights::{Builder, Stage, WeightsError};
 pub struct Decoder {
     /// The levels; index 0 is the deepest, at H/16 x W/16.
     pub levels: Vec<DecoderLevel>,
-    /// The 3x3 convolution to colour, followed by a ReLU; `None` with a kernel head.
+    /// The 1x1 (Fig. 3) or 3x3 (released reading) convolution to colour, followed by a ReLU; `None` with a
+    /// kernel head.
     pub head: Option<Conv2d>,
     /// The convolutions to kernels of the last levels, deepest first; none without a kernel head.
     pub kernels: Vec<Conv2d>,
@@ -46,7 +47,8 @@ impl Decoder {
         let head = init
             .map(|(weight, bias)| {
                 b.enter(Stage::Head { level: 0 }).part("head", |b| {
-                    conv3x3(b, [channels[0], COLOR_CHANNELS], weight, bias)
+                    let side = config.reading.spec().head_kernel;
+                    conv(b, [channels[0], COLOR_CHANNELS], side, weight, bias)
                 })
             })
             .transpose()?;
@@ -85,6 +87,9 @@ impl Decoder {
             }
         }
         match &self.head {
+            Some(head) if head.kernel_size == [1, 1] => {
+                (Maps::fuse(vec![x], head, Activation::Relu), None)
+            }
             Some(head) => (x.conv3x3(head, Activation::Relu), None),
             None => kernel_head::forward(&self.kernels, decoded, color_gamma, layers),
         }

@@ -76,7 +76,8 @@ pub(crate) fn skip_fusion(b: &mut Builder, channels: [usize; 2]) -> Result<Conv2
     conv(b, channels, 1, Init::IdentitySum, Init::Zeros)
 }
 
-fn conv(
+/// A convolution that keeps the size, with bias.
+pub(crate) fn conv(
     b: &mut Builder,
     [input, output]: [usize; 2],
     kernel: usize,

@@ -27,7 +27,11 @@ from demc.torch.network import READINGS, VARIANTS
 FIXTURES = Path(__file__).parent / "fixtures"
 WIDTH = 2
 SHAPE = (2, 64, 64)  # batch, height, width: the latent is 2 x 2, the smallest size that uses every tap of its 3x3 kernels
-SEEDS = {"grey": 0, "kernel": 2}  # found by trial, because the checks reject some seeds
+SEEDS = {  # found by trial, because the checks reject some seeds; 0 where none is named
+    "demc-paper-kernel": 2,
+    "demc-released-kernel": 2,
+    "semc-paper": 1,
+}
 STEPS, LEARNING_RATE = 5, 1e-3
 MARGIN = 0.2  # share of the Rust tests' tolerances that float32 rounding may use up
 OUTPUT_TOLERANCE = 1e-5  # of the largest value; these three are those of tests/tests/suite/parity/
@@ -46,7 +50,7 @@ def main() -> None:
             for head in ("grey", "kernel") if variant == "demc" else ("grey",):
                 config = ModelConfig(variant, reading, WIDTH, head=head)
                 name = f"{variant}-{reading}" + ("-kernel" if head == "kernel" else "")
-                weights = draw_weights(config, batch, np.random.RandomState(SEEDS[head]))
+                weights = draw_weights(config, batch, np.random.RandomState(SEEDS.get(name, 0)))
                 results = run(config, weights, batch, torch.float64)
                 check_alive(config, results)
                 worst = check_robust(config, results, run(config, weights, batch, torch.float32))

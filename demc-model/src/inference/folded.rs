@@ -66,6 +66,25 @@ impl FoldedConv {
         })
     }
 
+    /// The output convolution as one of 3x3: a kernel of 1x1 gets zeros around it.
+    ///
+    /// # Shapes
+    /// Weight `[out, in, 1, 1]` or `[out, in, 3, 3]`.
+    pub fn head(conv: &Conv2d) -> Self {
+        let folded = Self::conv(conv, None);
+        if conv.kernel_size != [1, 1] {
+            return folded;
+        }
+        let mut weight = vec![0.0; 9 * folded.weight().len()];
+        for (taps, value) in weight.chunks_exact_mut(9).zip(folded.weight()) {
+            taps[4] = *value;
+        }
+        FoldedConv {
+            weight: HostValues::Folded(weight),
+            ..folded
+        }
+    }
+
     /// A deconvolution and the normalisation of its output, on `flex`.
     ///
     /// # Shapes

@@ -132,11 +132,7 @@ impl InferencePass<'_> {
         let folded = folded_level(level);
         let prepared = self.prepare_level(level, &folded);
         let [_, skip_fusion] = &folded;
-        let conv: Vec<FoldedConv> = decoder
-            .head
-            .iter()
-            .map(|conv| FoldedConv::conv(conv, None))
-            .collect();
+        let conv: Vec<FoldedConv> = decoder.head.iter().map(FoldedConv::head).collect();
         let mut output = match kernel_head {
             Some(head) => OutputRows::Kernels {
                 filtered: head.filtered(0),

@@ -167,7 +167,7 @@ impl InferencePass<'_> {
             (Some(sources), head) => self.decode_full_resolution(&x, sources, head),
             (None, Some(head)) => Ok(head.finish()),
             (None, None) => {
-                let image = self.conv3x3(&x, &FoldedConv::conv(conv_head(decoder), None));
+                let image = self.conv3x3(&x, &FoldedConv::head(conv_head(decoder)));
                 let mut planar = memory::buffer(image.values.len());
                 grid::nchw_from_nhwc(image.grid, &image.values, &mut planar);
                 Ok((planar, None))

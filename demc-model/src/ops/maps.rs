@@ -96,7 +96,7 @@ impl Maps {
     /// `[B, K_i, H, W]` to `[B, out, H, W]`; the convolution has the sum of the `K_i` as input.
     ///
     /// # Panics
-    /// If the kernels run and the number of parts is not two or three.
+    /// If the kernels run and there are not one to three parts.
     pub fn fuse(parts: Vec<Maps>, conv: &Conv2d, activation: Activation) -> Self {
         let (tensors, ops) = split(parts);
         let tensor = match ops {

@@ -23,20 +23,20 @@ fn a_non_finite_loss_stops_the_run_and_names_its_patches() {
     let args = [&EXPLODE[..], &["--set=run.checkpoint_every=1"]].concat();
     let error = error_line(&train(&config(dir.path()), &run, &args), 1);
     for words in [
-        "step 3: non-finite loss or gradient: loss ",
+        "step 2: non-finite loss or gradient: loss ",
         "learning rate 1.000e1",
         "; patches: ",
         " (x ",
         "the last intact checkpoint is ",
-        "checkpoints/step-00000002",
+        "checkpoints/step-00000001",
         "train.on_nan=skip",
     ] {
         assert!(error.contains(words), "{words}: {error}");
     }
     // Two batches of two.
     assert!((1..=4).contains(&error.matches(" (x ").count()), "{error}");
-    assert!(run.join("checkpoints/step-00000002").is_dir());
-    assert!(!run.join("checkpoints/step-00000003").exists());
+    assert!(run.join("checkpoints/step-00000001").is_dir());
+    assert!(!run.join("checkpoints/step-00000002").exists());
 }
 
 #[test]
@@ -50,18 +50,18 @@ fn skipped_steps_are_counted_and_too_many_end_the_run() {
     let output = train(&config, &run, &[&EXPLODE[..], &skip].concat());
     let error = error_line(&output, 1);
     assert!(
-        error.contains("step 102: ") && error.contains("gradient in 100 consecutive steps"),
+        error.contains("step 101: ") && error.contains("gradient in 100 consecutive steps"),
         "{error}"
     );
     let text = String::from_utf8_lossy(&output.stdout);
     says(
         &text,
-        "warning: step 3: non-finite loss or gradient, skipped: ",
+        "warning: step 2: non-finite loss or gradient, skipped: ",
     );
     let lines = metrics(&run);
     assert!(lines[0]["loss"].is_number() && lines[1]["loss"].is_null());
-    assert_eq!(lines[0]["skipped"], 2, "of four steps");
-    assert_eq!(lines[1]["skipped"], 6);
+    assert_eq!(lines[0]["skipped"], 3, "of four steps");
+    assert_eq!(lines[1]["skipped"], 7);
 }
 
 #[test]

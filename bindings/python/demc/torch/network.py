@@ -67,11 +67,12 @@ class Reading:
     skip_after: tuple[int, ...]  # the skip is taken after this many of them
     norm: bool  # BatchNorm in the latent and after each deconvolution
     fuse_relu: bool  # ReLU after the 1x1 skip fusion
+    head_kernel: int  # side of the output convolution's kernel
 
 
 READINGS = {
-    "paper": Reading(convs=(3, 3, 3, 3, 3), skip_after=(2, 2, 2, 2, 2), norm=False, fuse_relu=True),
-    "released": Reading(convs=(2, 2, 3, 3, 3), skip_after=(2, 2, 3, 3, 3), norm=True, fuse_relu=False),
+    "paper": Reading(convs=(3, 3, 3, 3, 3), skip_after=(2, 2, 2, 2, 2), norm=False, fuse_relu=True, head_kernel=1),
+    "released": Reading(convs=(2, 2, 3, 3, 3), skip_after=(2, 2, 3, 3, 3), norm=True, fuse_relu=False, head_kernel=3),
 }
 
 
@@ -254,7 +255,7 @@ class DecoderLevel(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Five levels, the deepest first, and the head: conv3x3 to 3 channels and ReLU, or `kernel_head`."""
+    """Five levels, the deepest first, and the head: a convolution to 3 channels and ReLU, or `kernel_head`."""
 
     def __init__(self, levels: Sequence[int], encoders: int, reading: Reading, head: str) -> None:
         super().__init__()
@@ -266,7 +267,7 @@ class Decoder(nn.Module):
                 logits = KERNEL_TAPS + (level + 1 < KERNEL_LEVELS)
                 self.kernels.append(nn.Conv2d(levels[level], logits, 1))
         else:
-            self.head = conv3x3(levels[0], 3)
+            self.head = nn.Conv2d(levels[0], 3, reading.head_kernel, padding="same")
 
     def forward(
         self, latent: Tensor, skips: Sequence[Sequence[Tensor]], color_gamma: Tensor, layers: Tensor | None = None

@@ -73,7 +73,10 @@ fn head_is_pytorchs() {
             .into_iter()
             .map(|x| {
                 let head = model.decoder.head.as_ref().expect("a convolution");
-                x.conv3x3(head, Activation::None)
+                match head.kernel_size {
+                    [1, 1] => x.conv1x1(head),
+                    _ => x.conv3x3(head, Activation::None),
+                }
             })
             .collect()
     };
