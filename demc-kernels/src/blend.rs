@@ -9,7 +9,7 @@
 use rayon::prelude::*;
 
 use crate::Grid;
-use crate::filter5x5::COLORS;
+use crate::filter::COLORS;
 use crate::scratch::Scratch;
 
 /// Channels of a filtered image with its blend weight.

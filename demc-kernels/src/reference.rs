@@ -14,8 +14,9 @@ pub struct Gradients {
     pub dbias: Vec<f64>,
 }
 
-/// `(output pixel, input pixel, tap)` of a 3x3 convolution with padding 1, tap = 3 * row + column.
-fn taps3x3(grid: Grid) -> impl Iterator<Item = (usize, usize, usize)> {
+/// `(output pixel, input pixel, tap)` of a convolution that keeps the size, with a kernel of
+/// `side` x `side`; tap = side * row + column.
+fn taps(grid: Grid, side: usize) -> impl Iterator<Item = (usize, usize, usize)> {
     let Grid {
         batch,
         height,
@@ -23,8 +24,9 @@ fn taps3x3(grid: Grid) -> impl Iterator<Item = (usize, usize, usize)> {
     } = grid;
     (0..batch * height * width).flat_map(move |out| {
         let (b, y, x) = (out / (height * width), out / width % height, out % width);
-        (0..9).filter_map(move |tap| {
-            let (iy, ix) = ((y + tap / 3).checked_sub(1)?, (x + tap % 3).checked_sub(1)?);
+        (0..side * side).filter_map(move |tap| {
+            let iy = (y + tap / side).checked_sub(side / 2)?;
+            let ix = (x + tap % side).checked_sub(side / 2)?;
             (iy < height && ix < width).then_some((out, (b * height + iy) * width + ix, tap))
         })
     })
@@ -128,28 +130,55 @@ pub fn gated(dy: &[f64], y: &[f64]) -> Vec<f64> {
         .collect()
 }
 
-/// 3x3 convolution, padding 1, weight `[out, in, 3, 3]`.
-pub fn conv3x3(grid: Grid, x: &[f64], weight: &[f64], bias: &[f64], relu: bool) -> Vec<f64> {
+/// Convolution that keeps the size, weight `[out, in, side, side]`.
+fn convolution(
+    grid: Grid,
+    side: usize,
+    x: &[f64],
+    weight: &[f64],
+    bias: &[f64],
+    relu: bool,
+) -> Vec<f64> {
     let inputs = grid.channels(x.len());
-    let index = |o, i, tap| (o * inputs + i) * 9 + tap;
+    let index = |o, i, tap| (o * inputs + i) * side * side + tap;
+    let taps = taps(grid, side);
     rectified(
-        forward(taps3x3(grid), grid.pixels(), x, inputs, weight, bias, index),
+        forward(taps, grid.pixels(), x, inputs, weight, bias, index),
         relu,
     )
 }
 
+/// Gradients of [`convolution`].
+fn convolution_backward(
+    grid: Grid,
+    side: usize,
+    x: &[f64],
+    weight: &[f64],
+    dy: &[f64],
+) -> Gradients {
+    let (inputs, outputs) = (grid.channels(x.len()), grid.channels(dy.len()));
+    let index = |o, i, tap| (o * inputs + i) * side * side + tap;
+    backward(taps(grid, side), x, inputs, weight, dy, outputs, index)
+}
+
+/// 3x3 convolution, padding 1, weight `[out, in, 3, 3]`.
+pub fn conv3x3(grid: Grid, x: &[f64], weight: &[f64], bias: &[f64], relu: bool) -> Vec<f64> {
+    convolution(grid, 3, x, weight, bias, relu)
+}
+
 /// Gradients of [`conv3x3`].
 pub fn conv3x3_backward(grid: Grid, x: &[f64], weight: &[f64], dy: &[f64]) -> Gradients {
-    let (inputs, outputs) = (grid.channels(x.len()), grid.channels(dy.len()));
-    backward(
-        taps3x3(grid),
-        x,
-        inputs,
-        weight,
-        dy,
-        outputs,
-        |o, i, tap| (o * inputs + i) * 9 + tap,
-    )
+    convolution_backward(grid, 3, x, weight, dy)
+}
+
+/// 5x5 convolution, padding 2, weight `[out, in, 5, 5]`.
+pub fn conv5x5(grid: Grid, x: &[f64], weight: &[f64], bias: &[f64], relu: bool) -> Vec<f64> {
+    convolution(grid, 5, x, weight, bias, relu)
+}
+
+/// Gradients of [`conv5x5`].
+pub fn conv5x5_backward(grid: Grid, x: &[f64], weight: &[f64], dy: &[f64]) -> Gradients {
+    convolution_backward(grid, 5, x, weight, dy)
 }
 
 /// 1x1 convolution, weight `[out, in]`.
@@ -198,26 +227,30 @@ pub fn deconv4x4_backward(grid: Grid, x: &[f64], weight: &[f64], dy: &[f64]) -> 
     )
 }
 
-/// Every pixel with its own 5x5 kernel, the softmax of its first 25 logits, border replicated. A
-/// 26th logit becomes a fourth channel, its sigmoid.
-pub fn filter5x5(grid: Grid, x: &[f64], logits: &[f64]) -> Vec<f64> {
+/// Every pixel with its own square kernel, the softmax of its logits, border replicated. One more
+/// logit becomes a fourth channel, its sigmoid.
+pub fn filter(grid: Grid, x: &[f64], logits: &[f64]) -> Vec<f64> {
     let channels = grid.channels(logits.len());
+    let side = channels.isqrt();
+    let (reach, taps) = (side / 2, side * side);
     let Grid { height, width, .. } = grid;
     let mut out = Vec::new();
     for (pixel, logits) in logits.chunks(channels).enumerate() {
         let (image, row) = (pixel / (height * width), pixel / width % height);
-        let weights: Vec<f64> = logits[..25].iter().map(|logit| logit.exp()).collect();
+        let weights: Vec<f64> = logits[..taps].iter().map(|logit| logit.exp()).collect();
         let sum: f64 = weights.iter().sum();
         for channel in 0..3 {
             let taps = weights.iter().enumerate().map(|(tap, weight)| {
-                let y = (row + tap / 5).saturating_sub(2).min(height - 1);
-                let x_at = (pixel % width + tap % 5).saturating_sub(2).min(width - 1);
+                let y = (row + tap / side).saturating_sub(reach).min(height - 1);
+                let x_at = (pixel % width + tap % side)
+                    .saturating_sub(reach)
+                    .min(width - 1);
                 weight / sum * x[((image * height + y) * width + x_at) * 3 + channel]
             });
             out.push(taps.sum());
         }
         out.extend(
-            logits[25..]
+            logits[taps..]
                 .iter()
                 .map(|logit| 1.0 / (1.0 + (-logit).exp())),
         );

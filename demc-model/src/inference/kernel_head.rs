@@ -7,7 +7,7 @@ use burn::backend::flex::FlexTensor;
 use burn::tensor::Tensor;
 use demc_kernels::blend::{self, Scales};
 use demc_kernels::conv1x1::{Epilogue, Part, forward_part};
-use demc_kernels::filter5x5::{self, Filter};
+use demc_kernels::filter::{self, Filter};
 use demc_kernels::{Grid, Isa, grid, memory, power};
 use rayon::prelude::*;
 
@@ -78,7 +78,7 @@ impl KernelHead {
 
     /// The images of a level to be filtered into.
     pub(super) fn filtered(&self, level: usize) -> FeatureMaps {
-        let channels = COLOR_CHANNELS + self.convs[level].outputs() - filter5x5::TAPS;
+        let channels = filter::outputs(self.convs[level].outputs());
         FeatureMaps::new(self.scales[level].grid, channels)
     }
 
@@ -112,7 +112,7 @@ impl KernelHead {
         };
         let targets = filtered.rows_of_images_mut(images, rows.clone());
         let filter = Filter { x, logits: &logits };
-        filter5x5::forward_rows(self.isa, grid, filter, rows, targets);
+        filter::forward_rows(self.isa, grid, filter, rows, targets);
     }
 
     /// Completes a level: blends the filtered image with the output so far.

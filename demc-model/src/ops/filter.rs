@@ -15,7 +15,7 @@ pub(super) fn halve(x: Tensor<4>) -> Tensor<4> {
     avg_pool2d(x, AvgPoolOptions::new([2, 2]))
 }
 
-/// See [`demc_kernels::filter5x5::forward`]. Several images may share the kernels of one.
+/// See [`demc_kernels::filter::forward`]. Several images may share the kernels of one.
 pub(super) fn filter5x5(x: Tensor<4>, logits: Tensor<4>) -> Tensor<4> {
     let [batch, ..] = x.dims();
     let [_, channels, height, width] = logits.dims();

@@ -4,10 +4,10 @@ use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use demc_kernels::batch_norm::{BatchNorm, Moments};
 use demc_kernels::blend::Scales;
-use demc_kernels::filter5x5::Filter;
+use demc_kernels::filter::Filter;
 use demc_kernels::rel_mse::RelMse;
 use demc_kernels::{
-    Convolution, Grid, Isa, batch_norm, blend, conv1x1, conv3x3, deconv4x4, filter5x5, grid, pool,
+    Convolution, Grid, Isa, batch_norm, blend, conv1x1, conv3x3, deconv4x4, filter, grid, pool,
     rel_mse,
 };
 
@@ -117,19 +117,19 @@ impl KernelOps for Flex {
     fn filter5x5(x: FlexTensor, logits: FlexTensor) -> FlexTensor {
         let [x, logits] = [x, logits].map(contiguous);
         let ((images, _), (grid, channels)) = (grid(&x), grid(&logits));
-        let mut y = buffer(images.pixels() * (filter5x5::COLORS + channels - filter5x5::TAPS));
+        let mut y = buffer(images.pixels() * (filter::outputs(channels)));
         let filter = Filter {
             x: values(&x),
             logits: values(&logits),
         };
-        filter5x5::forward(Isa::current(), grid, filter, &mut y);
+        filter::forward(Isa::current(), grid, filter, &mut y);
         maps(images, y)
     }
 
     fn blend(filtered: FlexTensor, coarse: FlexTensor) -> FlexTensor {
         let [filtered, coarse] = [filtered, coarse].map(contiguous);
         let (grid, _) = grid(&filtered);
-        let mut out = buffer(grid.pixels() * filter5x5::COLORS);
+        let mut out = buffer(grid.pixels() * filter::COLORS);
         let scales = Scales {
             filtered: values(&filtered),
             coarse: values(&coarse),

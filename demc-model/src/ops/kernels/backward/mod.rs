@@ -15,8 +15,8 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, AutodiffBackend, Flex};
 use demc_kernels::batch_norm::{BatchNormSource, Moments};
 use demc_kernels::blend::Scales;
-use demc_kernels::filter5x5::Filter;
-use demc_kernels::{Isa, batch_norm, blend, filter5x5, pool};
+use demc_kernels::filter::Filter;
+use demc_kernels::{Isa, batch_norm, blend, filter, pool};
 
 use super::forward::{fuse, rel_mse_into};
 use super::{KernelOps, buffer, contiguous, dims, grid, maps, tensor, values};
@@ -226,7 +226,7 @@ impl Backward<Flex, 1> for Filter5x5 {
                 x: values(&x),
                 logits: values(&logits),
             };
-            filter5x5::backward(Isa::current(), grid, filter, values(&dy), &mut dlogits);
+            filter::backward(Isa::current(), grid, filter, values(&dy), &mut dlogits);
             grads.register::<Flex>(node.id, maps(grid, dlogits));
         }
     }

@@ -1,7 +1,6 @@
-//! Filtering with one 5x5 kernel per pixel (kernel prediction, Bako et al. 2017), and the blend of
-//! two scales (Vogels et al. 2018).
+//! Filtering with one kernel per pixel, 5x5 or 21x21 (kernel prediction, Bako et al. 2017).
 //!
-//! Both are linear in the image. No operation is fused, so the bits are the same on every path.
+//! It is linear in the image. No operation is fused, so the bits are the same on every path.
 
 mod block;
 #[cfg(test)]
@@ -12,9 +11,30 @@ use std::ops::Range;
 use crate::simd::{self, Leaf, Simd};
 use crate::tasks;
 use crate::{Grid, Isa};
-use block::{BLOCK, PaddedRows, SIDE, blends_of, kernels_of};
+use block::{BLOCK, PaddedRows, blends_of, kernels_of};
 
-pub use block::{COLORS, TAPS};
+pub use block::COLORS;
+
+/// Sides of the kernels, in pixels.
+const SIDES: [usize; 2] = [5, 21];
+
+/// Channels of the output, with these logits of a kernel: 3, or 4 with a blend weight.
+///
+/// # Panics
+/// If no kernel has this number of logits.
+#[track_caller]
+pub fn outputs(logits: usize) -> usize {
+    COLORS + logits - side_of(logits).pow(2)
+}
+
+/// The side of the kernel with this number of logits.
+#[track_caller]
+fn side_of(logits: usize) -> usize {
+    let side = SIDES
+        .into_iter()
+        .find(|side| (side * side..=side * side + 1).contains(&logits));
+    side.unwrap_or_else(|| panic!("{logits} logits per pixel"))
+}
 
 /// Images, and the logits of the kernels that filter them.
 #[derive(Clone, Copy, Debug)]
@@ -25,13 +45,13 @@ pub struct Filter<'a> {
     pub logits: &'a [f32],
 }
 
-/// Filters each pixel with its own 5x5 kernel: the softmax of its first 25 logits. The image's
-/// border is replicated. A 26th logit becomes a fourth channel, its sigmoid.
+/// Filters each pixel with its own kernel, 5x5 or 21x21: the softmax of its first 25 or 441 logits.
+/// The image's border is replicated. One more logit becomes a fourth channel, its sigmoid.
 ///
 /// Several images may share kernels: the layers of a rendering. Their kernels are computed once.
 ///
 /// # Shapes
-/// `logits` of 25 or 26 channels on `grid`. Image `x` of 3 channels and `y` of 3 or 4 have `n` images
+/// `logits` of 25, 26, 441, or 442 channels on `grid`. Image `x` of 3 channels and `y` of 3 or 4 have `n` images
 /// for each one of `grid`; these `n` are adjacent.
 ///
 /// # Panics
@@ -99,16 +119,32 @@ pub fn forward_rows(isa: Isa, grid: Grid, filter: Filter, rows: Range<usize>, y:
         let rows = start..start + logits.len() / row;
         let images: Vec<PaddedRows> = x
             .chunks(single.pixels() * COLORS)
-            .map(|x| PaddedRows::new(single, x, rows.clone()))
+            .map(|x| PaddedRows::new(single, x, rows.clone(), shape.side))
             .collect();
-        let leaf = Forward {
-            shape,
-            images: &images,
-            logits,
-            y,
-        };
+        let images = &images;
         // SAFETY: the leaf accesses memory through slices only.
-        unsafe { simd::run(isa, leaf) }
+        unsafe {
+            match shape.side {
+                5 => simd::run(
+                    isa,
+                    Forward::<5, 25> {
+                        shape,
+                        images,
+                        logits,
+                        y,
+                    },
+                ),
+                _ => simd::run(
+                    isa,
+                    Forward::<21, 441> {
+                        shape,
+                        images,
+                        logits,
+                        y,
+                    },
+                ),
+            }
+        }
     });
 }
 
@@ -151,22 +187,41 @@ pub fn backward(isa: Isa, grid: Grid, filter: Filter, dy: &[f32], dlogits: &mut 
         bands.map(move |(piece, ((logits, dy), dlogits))| (x, piece * step, logits, dy, dlogits))
     });
     tasks::each(pieces, |(x, start, logits, dy, dlogits)| {
-        let image = PaddedRows::new(single, x, start..start + logits.len() / row);
-        let leaf = Backward {
-            shape,
-            image: &image,
-            logits,
-            dy,
-            dlogits,
-        };
+        let rows = start..start + logits.len() / row;
+        let image = &PaddedRows::new(single, x, rows, shape.side);
+        let isa = tasks::streaming(isa);
         // SAFETY: the leaf accesses memory through slices only.
-        unsafe { simd::run(tasks::streaming(isa), leaf) }
+        unsafe {
+            match shape.side {
+                5 => simd::run(
+                    isa,
+                    Backward::<5, 25> {
+                        shape,
+                        image,
+                        logits,
+                        dy,
+                        dlogits,
+                    },
+                ),
+                _ => simd::run(
+                    isa,
+                    Backward::<21, 441> {
+                        shape,
+                        image,
+                        logits,
+                        dy,
+                        dlogits,
+                    },
+                ),
+            }
+        }
     });
 }
 
 #[derive(Clone, Copy)]
 struct Shape {
     width: usize,
+    side: usize,
     logits: usize,
     outputs: usize,
 }
@@ -175,14 +230,11 @@ impl Shape {
     #[track_caller]
     fn of(grid: Grid, logits: usize) -> Self {
         let logits = grid.channels(logits);
-        assert!(
-            (TAPS..=TAPS + 1).contains(&logits),
-            "{logits} logits per pixel"
-        );
         Shape {
             width: grid.width,
+            side: side_of(logits),
             logits,
-            outputs: COLORS + logits - TAPS,
+            outputs: outputs(logits),
         }
     }
 
@@ -198,7 +250,7 @@ impl Shape {
     }
 }
 
-struct Forward<'a> {
+struct Forward<'a, const SIDE: usize, const TAPS: usize> {
     shape: Shape,
     images: &'a [PaddedRows],
     logits: &'a [f32],
@@ -206,7 +258,7 @@ struct Forward<'a> {
     y: Vec<&'a mut [f32]>,
 }
 
-impl Leaf for Forward<'_> {
+impl<const SIDE: usize, const TAPS: usize> Leaf for Forward<'_, SIDE, TAPS> {
     type Out = ();
 
     #[inline(always)]
@@ -215,11 +267,12 @@ impl Leaf for Forward<'_> {
             width,
             logits: channels,
             outputs,
+            ..
         } = self.shape;
         for (row, logits) in self.logits.chunks_exact(width * channels).enumerate() {
             for (block, logits) in logits.chunks(BLOCK * channels).enumerate() {
-                let kernels = kernels_of(logits, channels);
-                let blends = blends_of(logits, channels);
+                let kernels = kernels_of::<TAPS>(logits, channels);
+                let blends = blends_of::<TAPS>(logits, channels);
                 let first = (row * width + block * BLOCK) * outputs;
                 let values = logits.len() / channels * outputs;
                 for (image, y) in self.images.iter().zip(&mut self.y) {
@@ -254,7 +307,7 @@ impl Leaf for Forward<'_> {
     }
 }
 
-struct Backward<'a> {
+struct Backward<'a, const SIDE: usize, const TAPS: usize> {
     shape: Shape,
     image: &'a PaddedRows,
     logits: &'a [f32],
@@ -262,7 +315,7 @@ struct Backward<'a> {
     dlogits: &'a mut [f32],
 }
 
-impl Leaf for Backward<'_> {
+impl<const SIDE: usize, const TAPS: usize> Leaf for Backward<'_, SIDE, TAPS> {
     type Out = ();
 
     #[inline(always)]
@@ -271,6 +324,7 @@ impl Leaf for Backward<'_> {
             width,
             logits: channels,
             outputs,
+            ..
         } = self.shape;
         let rows = (self.logits.chunks_exact(width * channels))
             .zip(self.dy.chunks_exact(width * outputs))
@@ -280,14 +334,14 @@ impl Leaf for Backward<'_> {
                 .zip(dy.chunks(BLOCK * outputs))
                 .zip(dlogits.chunks_mut(BLOCK * channels));
             for (block, ((logits, dy), dlogits)) in blocks.enumerate() {
-                let kernels = kernels_of(logits, channels);
+                let kernels = kernels_of::<TAPS>(logits, channels);
                 let mut dcolors = [[0.0; BLOCK]; COLORS];
                 for (pixel, dy) in dy.chunks_exact(outputs).enumerate() {
                     for (color, dy) in dcolors.iter_mut().zip(dy) {
                         color[pixel] = *dy;
                     }
                 }
-                let blends = blends_of(logits, channels);
+                let blends = blends_of::<TAPS>(logits, channels);
                 let mut slopes = [[0.0; BLOCK]; TAPS];
                 for first in (0..BLOCK).step_by(S::LANES) {
                     // SAFETY: all blocks hold whole vectors from `first` on.

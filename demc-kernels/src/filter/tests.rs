@@ -6,6 +6,11 @@ use crate::testing::{
     assert_close, assert_within, bits, f64s, few, grids, pattern, same_on_any_number_of_threads,
 };
 
+/// Logits of a kernel of 5x5.
+const TAPS: usize = 25;
+/// Numbers of logits that a kernel may have.
+const LOGITS: [usize; 4] = [TAPS, TAPS + 1, 441, 442];
+
 fn logits(grid: Grid, channels: usize) -> Vec<f32> {
     pattern(grid.pixels() * channels, 5)
         .iter()
@@ -17,9 +22,9 @@ fn logits(grid: Grid, channels: usize) -> Vec<f32> {
 fn it_is_the_plain_sum_on_every_path() {
     for grid in grids() {
         let x = pattern(grid.pixels() * COLORS, 1);
-        for channels in [TAPS, TAPS + 1] {
+        for channels in LOGITS {
             let logits = logits(grid, channels);
-            let expected = reference::filter5x5(grid, &f64s(&x), &f64s(&logits));
+            let expected = reference::filter(grid, &f64s(&x), &f64s(&logits));
             for isa in Isa::available() {
                 let mut y = vec![f32::NAN; expected.len()];
                 let filter = Filter {
@@ -39,8 +44,8 @@ fn images_that_share_kernels_are_filtered_as_each_alone() {
     for grid in few(grids(), 2) {
         let (pixels, sharing) = (grid.height * grid.width, 3);
         let x = pattern(sharing * grid.pixels() * COLORS, 1);
-        for channels in [TAPS, TAPS + 1] {
-            let (logits, outputs) = (logits(grid, channels), COLORS + channels - TAPS);
+        for channels in LOGITS {
+            let (logits, outputs) = (logits(grid, channels), outputs(channels));
             for isa in Isa::available() {
                 let mut y = vec![f32::NAN; sharing * grid.pixels() * outputs];
                 let filter = Filter {
@@ -67,12 +72,15 @@ fn images_that_share_kernels_are_filtered_as_each_alone() {
 /// Central differences of the float64 loops.
 #[test]
 fn the_gradient_is_that_of_differences() {
-    for grid in few(grids(), 1) {
+    let cases = few(grids(), 1)
+        .into_iter()
+        .flat_map(|grid| [TAPS + 1, 441].map(|n| (grid, n)));
+    for (grid, channels) in cases {
         let x = pattern(grid.pixels() * COLORS, 1);
-        let logits = logits(grid, TAPS + 1);
-        let dy = pattern(grid.pixels() * (COLORS + 1), 3);
+        let logits = logits(grid, channels);
+        let dy = pattern(grid.pixels() * outputs(channels), 3);
         let sum = |logits: &[f64]| -> f64 {
-            let y = reference::filter5x5(grid, &f64s(&x), logits);
+            let y = reference::filter(grid, &f64s(&x), logits);
             y.iter().zip(&dy).map(|(y, dy)| y * f64::from(*dy)).sum()
         };
         let mut found = vec![f32::NAN; logits.len()];

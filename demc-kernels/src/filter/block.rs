@@ -8,21 +8,14 @@ use crate::scratch::Scratch;
 
 /// Channels of the filtered image.
 pub const COLORS: usize = 3;
-/// Side of a kernel, in pixels.
-pub(super) const SIDE: usize = 5;
-/// Pixels on each side of the centre.
-pub(super) const REACH: usize = SIDE / 2;
-/// Weights of a kernel.
-pub const TAPS: usize = SIDE * SIDE;
-
 /// Pixels of a row that are computed together, one per lane.
 pub(super) const BLOCK: usize = 16;
 
 /// One value for each pixel of a block.
 type Lanes = [f32; BLOCK];
 
-/// Some rows of an image with two more pixels on each side, each row as three planes. Blocks may
-/// read beyond the row.
+/// Some rows of an image with more pixels on each side, as far as a kernel reaches, each row as three
+/// planes. Blocks may read beyond the row.
 pub(super) struct PaddedRows {
     values: Scratch,
     /// Values of a plane of a row.
@@ -30,17 +23,18 @@ pub(super) struct PaddedRows {
 }
 
 impl PaddedRows {
-    pub(super) fn new(grid: Grid, x: &[f32], rows: Range<usize>) -> Self {
-        let stride = grid.width.next_multiple_of(BLOCK) + 2 * REACH;
-        let mut values = Scratch::take((rows.len() + 2 * REACH) * COLORS * stride);
+    pub(super) fn new(grid: Grid, x: &[f32], rows: Range<usize>, side: usize) -> Self {
+        let reach = side / 2;
+        let stride = grid.width.next_multiple_of(BLOCK) + 2 * reach;
+        let mut values = Scratch::take((rows.len() + 2 * reach) * COLORS * stride);
         for (line, planes) in values.chunks_exact_mut(COLORS * stride).enumerate() {
             let row = (rows.start + line)
-                .saturating_sub(REACH)
+                .saturating_sub(reach)
                 .min(grid.height - 1);
             let source = &x[row * grid.width * COLORS..(row + 1) * grid.width * COLORS];
             let (first, last) = (&source[..COLORS], &source[source.len() - COLORS..]);
             for (color, plane) in planes.chunks_exact_mut(stride).enumerate() {
-                let (before, rest) = plane.split_at_mut(REACH);
+                let (before, rest) = plane.split_at_mut(reach);
                 let (own, after) = rest.split_at_mut(grid.width);
                 before.fill(first[color]);
                 after.fill(last[color]);
@@ -62,9 +56,9 @@ impl PaddedRows {
     }
 }
 
-/// The kernels of the pixels of a block: the softmax of their first 25 logits, tap by tap.
+/// The kernels of the pixels of a block: the softmax of their first logits, tap by tap.
 #[inline(always)]
-pub(super) fn kernels_of(logits: &[f32], channels: usize) -> [Lanes; TAPS] {
+pub(super) fn kernels_of<const TAPS: usize>(logits: &[f32], channels: usize) -> [Lanes; TAPS] {
     let mut kernels = [[0.0; BLOCK]; TAPS];
     for (pixel, logits) in logits.chunks_exact(channels).enumerate() {
         for (tap, logit) in kernels.iter_mut().zip(logits) {
@@ -93,9 +87,10 @@ pub(super) fn kernels_of(logits: &[f32], channels: usize) -> [Lanes; TAPS] {
     kernels
 }
 
-/// The blend weights of the pixels of a block: the sigmoid of their 26th logits.
+/// The blend weights of the pixels of a block: the sigmoid of the logits after their kernels', if there
+/// is one.
 #[inline(always)]
-pub(super) fn blends_of(logits: &[f32], channels: usize) -> Lanes {
+pub(super) fn blends_of<const TAPS: usize>(logits: &[f32], channels: usize) -> Lanes {
     let mut blends = [0.0; BLOCK];
     if channels > TAPS {
         let logits = logits.chunks_exact(channels);
