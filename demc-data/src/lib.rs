@@ -22,6 +22,7 @@
 #![forbid(unsafe_code)]
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
+pub mod array_lengths;
 pub mod check;
 #[cfg(feature = "cli")]
 pub mod cli;

@@ -4,8 +4,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+use demc_data::array_lengths;
 use serde::de::{DeserializeOwned, Deserializer, Error as _, Visitor, value::Error as FieldsError};
-use serde::forward_to_deserialize_any;
+use serde::{Serialize, forward_to_deserialize_any};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
@@ -13,7 +14,7 @@ use toml::{Table, Value};
 const MIN_SIMILARITY: f64 = 0.75;
 
 /// Parses `text`, applies `sets`, and refuses keys that are not in `keys` (`table.key`).
-pub(super) fn parse<T: DeserializeOwned>(
+pub(super) fn parse<T: DeserializeOwned + Serialize>(
     path: &Path,
     text: &str,
     sets: &[String],
@@ -44,10 +45,11 @@ pub(super) fn parse<T: DeserializeOwned>(
         return Err(problems.join("; "));
     }
     let config = toml::from_str::<T>(text).map_err(|error| located(&error))?;
+    let mut tables: Table = toml::from_str(text).map_err(|error| located(&error))?;
+    array_lengths::check(&tables, &config).map_err(|problem| format!("{path}: {problem}"))?;
     if edits.is_empty() {
         return Ok(config);
     }
-    let mut tables: Table = toml::from_str(text).map_err(|error| located(&error))?;
     for (set, edit) in edits {
         let named = |problem: String| format!("--set {set}: {problem}");
         edit.apply(&mut tables).map_err(named)?;

@@ -92,6 +92,17 @@ fn wrong_types_name_line_and_expectation() {
 }
 
 #[test]
+fn a_list_that_is_too_long_is_refused() {
+    let text = "[model]\nlevels = [1, 2, 4, 8, 8, 9]";
+    for sets in [&[][..], &["run.dir=x"]] {
+        let error = parsed(text, sets).unwrap_err();
+        assert_eq!(error, "run.toml: model.levels has 6 values instead of 5");
+    }
+    let error = parsed("", &["model.levels=[1, 2, 4, 8, 8, 9]"]).unwrap_err();
+    assert!(error.contains("--set model.levels="), "{error}");
+}
+
+#[test]
 fn broken_toml_names_the_line() {
     let error = parsed("[train]\nsteps = = 3\n", &[]).unwrap_err();
     assert!(error.starts_with("run.toml:2: "), "{error}");

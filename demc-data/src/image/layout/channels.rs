@@ -8,6 +8,7 @@ use demc_program::message::printable;
 use serde::{Deserialize, Serialize};
 
 use super::passes::{NamedBuffer, Passes, Triple};
+use crate::array_lengths;
 use crate::error::Error;
 
 /// The start of a name that stands for any view layer, the same one in all names of a layout.
@@ -203,6 +204,8 @@ impl ChannelLayout {
     pub fn from_toml(name: &str, text: &str) -> Result<Self, Error> {
         let layout: Self =
             toml::from_str(text).map_err(|error| mistake(name, one_line(&error, text)))?;
+        let written = toml::from_str(text).expect("it was just read");
+        array_lengths::check(&written, &layout).map_err(|problem| mistake(name, problem))?;
         match layout.validate() {
             problems if problems.is_empty() => Ok(layout),
             problems => Err(mistake(name, problems.join("; "))),

@@ -89,6 +89,28 @@ fn all_problems_are_named_at_once() {
 }
 
 #[test]
+fn lists_that_are_too_long_are_refused() {
+    let text = PRESETS[0].1;
+    for (from, to, message) in [
+        (
+            "[\"R\", \"G\", \"B\"]",
+            "[\"R\", \"G\", \"B\", \"Z\"]",
+            "color has 4 values instead of 3",
+        ),
+        (
+            "[\"half1.\", \"half2.\"]",
+            "[\"half1.\", \"half2.\", \"half3.\"]",
+            "passes.half_buffers has 3 values instead of 2",
+        ),
+    ] {
+        let changed = text.replacen(from, to, 1);
+        assert_ne!(changed, text);
+        let error = ChannelLayout::from_toml("own.toml", &changed).unwrap_err();
+        assert!(error.to_string().contains(message), "{error}");
+    }
+}
+
+#[test]
 fn unknown_keys_are_refused_with_their_line() {
     let error = message(&format!("{MINIMAL}albedo3 = [\"a\", \"b\", \"c\"]"));
     assert!(
