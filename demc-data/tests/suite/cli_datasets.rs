@@ -234,11 +234,37 @@ fn index_keeps_the_keys_that_it_does_not_set() {
     assert_eq!(manifest["renderer"], "mine");
     let scene = &manifest["scenes"][0];
     assert_eq!(
-        (&scene["width"], &scene["split"]),
-        (&json!(4), &json!("train"))
+        (&scene["width"], &scene["split"], &scene["base"]),
+        (&json!(4), &json!("test"), &json!("old"))
     );
     assert_eq!(scene["licences"], json!(["CC0"]));
-    assert_eq!(manifest["scenes"][1]["name"], "x-a");
+    let other = &manifest["scenes"][1];
+    assert_eq!(
+        (&other["name"], &other["split"]),
+        (&json!("x-a"), &json!("train"))
+    );
+    // The rules replace what was kept.
+    let rules = ["--test", "x/*", "--base", "^(.*)$"];
+    stdout(&[&["index", &dir.text(""), "--overwrite"], &rules[..]].concat());
+    let scenes = &dir.manifest()["scenes"];
+    assert_eq!(
+        [&scenes[0]["split"], &scenes[1]["split"]],
+        [&json!("train"), &json!("test")]
+    );
+    assert_eq!(scenes[0]["base"], "a");
+}
+
+#[test]
+#[cfg(unix)]
+fn index_counts_broken_links_and_refuses_one_file_under_two_names() {
+    let dir = Dir::new();
+    dir.scene("a.exr");
+    std::os::unix::fs::symlink(dir.path("nothing.exr"), dir.path("b.exr")).expect("a link");
+    let text = stdout(&["index", &dir.text("")]);
+    assert!(text.contains("other files and links, ignored: 1"), "{text}");
+    std::os::unix::fs::symlink(dir.path("a.exr"), dir.path("c.exr")).expect("a link");
+    let same = "a.exr and c.exr are the same file; remove one";
+    refused(&["index", &dir.text(""), "--overwrite"], 1, same);
 }
 
 #[test]

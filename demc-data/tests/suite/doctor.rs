@@ -620,6 +620,22 @@ fn wrong_passes_are_told_apart() {
             .has("passes are incomplete", "bad")
             .starts_with("variance.depth.Z;")
     );
+    let lacking = damaged(&|planes| drop(planes.remove("half1.R")));
+    lacking.has("passes are incomplete", "bad");
+    for start in ["half1.", "specular.", "ref.diffuse.", "depth."] {
+        let lacking = damaged(&|planes| planes.retain(|name, _| !name.starts_with(start)));
+        lacking.has("passes are incomplete", "bad");
+    }
+    let flat = damaged(&|planes| {
+        for name in ["diffuse.R", "diffuse.G", "diffuse.B"] {
+            let variance = format!("variance.{name}");
+            planes.get_mut(&variance).expect("there").fill(0.0);
+        }
+    });
+    flat.has(
+        "variances of diffuse and specular do not fit that of color",
+        "bad",
+    );
     let equal = damaged(&|planes| {
         for name in ["R", "G", "B"] {
             let whole = planes[name].clone();

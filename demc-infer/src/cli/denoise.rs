@@ -1,22 +1,24 @@
 //! `demc-infer denoise`: denoises EXR files one after another.
 
+mod work;
+
 use std::ops::ControlFlow;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
+use demc_data::ChannelLayout;
 use demc_data::image::exr::ExrFile;
 use demc_data::image::frame::{decode_input, decode_repaired};
 use demc_data::image::rewrite::Replaced;
-use demc_data::input::ranges;
-use demc_data::{ChannelLayout, Frame};
+use demc_program::checksum::sha256_of;
 use demc_program::message;
 use demc_program::output::{Directories, Outputs};
 
 use super::clamped::Clamped;
-use super::exposure::{InputScaleFlag, SequenceScales, stops};
+use super::exposure::{InputScale, InputScaleFlag, SequenceScales, stops};
 use super::flags::{DeviceFlag, EnsembleFlag, LightFlag, ModelFlag, TilingFlags, describe};
 use super::frames::Frames;
-use super::inputs::Inputs;
+use super::inputs::{Inputs, place};
 use super::jobs::{Job, Jobs};
 use super::layers::{LayersFlag, read_layers};
 use super::layouts::{LayoutFlags, Layouts};
@@ -26,19 +28,10 @@ use super::progress::Progress;
 use super::record::Record;
 use super::shard::Shard;
 use super::warnings::Warnings;
-use crate::denoise::{DenoiseOptions, DenoiseProgress, Layer, SeamError};
+use crate::denoise::{DenoiseOptions, DenoiseProgress};
 use crate::guard::{EnergyBias, Warning};
-use crate::{Bundle, Ensemble, memory};
-
-/// Largest cache of an input's decoded blocks in bytes, kept until its output is written (ours:
-/// three times 19 half channels of 1920x1080). Blocks beyond it are decompressed twice.
-const MAX_CACHE: u64 = 256 << 20;
-
-/// Size of that cache with the available memory, most of which the network needs.
-fn cache_bytes() -> usize {
-    let share = memory::available().map_or(MAX_CACHE, |bytes| bytes / 16);
-    share.min(MAX_CACHE) as usize
-}
+use crate::{Bundle, Ensemble};
+use work::{Contents, Prepared, Work, cache_bytes, described, far_from_sequence};
 
 /// Denoise OpenEXR images of up to 32768 pixels a side and 134217728 pixels.
 ///
@@ -76,7 +69,7 @@ pub struct Arguments {
     #[arg(value_name = "IN.exr", required = true)]
     inputs: Vec<PathBuf>,
     /// Output file for one input, NAME.exr, or output directory. Directories are created if needed. Images that
-    /// exist are skipped, unless their input is newer
+    /// exist are skipped, unless their input was written again
     #[arg(short, long, value_name = "OUT")]
     output: PathBuf,
     /// Replace NaN, infinite and negative samples by the median of their neighbours. Without it, an
@@ -135,15 +128,18 @@ impl Arguments {
             jobs.keep(shard);
         }
         let mut outputs = Outputs::default();
+        inputs.protect(&mut outputs);
         self.model.protect(&mut outputs);
         self.layout.protect(&mut outputs);
         jobs.claim(&mut outputs)?;
         let layouts = self.layout.read()?;
         let bundle = self.model.load_onto(&self.device)?;
         self.layers.check(&bundle, self.ensemble.passes)?;
-        let record = self.record(&bundle)?;
+        let record = self.record(&bundle, &layouts)?;
+        let mut scales = SequenceScales::new(&inputs.sequences);
         if !self.overwrite {
-            jobs.skip_existing(&record, self.exposure, &mut outputs);
+            let of_image = |input: &Path| self.image_record(&record, input, &scales).ok();
+            jobs.skip_existing(of_image, self.exposure, &mut outputs);
         }
         let kept = jobs.report_skipped()?;
         outputs.prepare(Directories::Create)?;
@@ -151,7 +147,7 @@ impl Arguments {
         let work = Work {
             bundle,
             layouts,
-            record: record.text(),
+            record,
             progress: Progress::new(jobs.len()),
             warnings: Warnings::default(),
         };
@@ -161,7 +157,6 @@ impl Arguments {
             progress,
             ..
         } = &work;
-        let mut scales = SequenceScales::new(&inputs.sequences);
         let mut clamped = Clamped::default();
         let mut failed = 0;
         for job in &jobs {
@@ -170,7 +165,10 @@ impl Arguments {
                 None => scales.exposure(&job.input, bundle, layouts),
                 Some(_) => None,
             };
-            match self.image(&work, job, exposure) {
+            let done = self
+                .image_record(&work.record, &job.input, &scales)
+                .and_then(|record| self.image(&work, job, &record, exposure));
+            match done {
                 Ok(samples) => clamped.count(samples),
                 Err(error) if jobs.len() == 1 && kept == 0 => return Err(error),
                 Err(error) => {
@@ -196,9 +194,9 @@ impl Arguments {
     }
 
     /// The options that change an output.
-    fn record(&self, bundle: &Bundle) -> anyhow::Result<Record> {
+    fn record(&self, bundle: &Bundle, layouts: &Layouts) -> anyhow::Result<Record> {
         let mut record = Record::of_model(&self.model.short_name(), &bundle.checksum()?);
-        self.layout.record(&mut record);
+        layouts.record(&mut record);
         self.layers.record(&mut record);
         self.output_flags.record(&mut record);
         if self.repair {
@@ -217,9 +215,35 @@ impl Arguments {
         Ok(record)
     }
 
+    /// The record of an image: the options, its file, and its sequence, if that decides its factor.
+    fn image_record(
+        &self,
+        options: &Record,
+        input: &Path,
+        scales: &SequenceScales,
+    ) -> anyhow::Result<Record> {
+        let (directory, name) = place(input);
+        let directory = directory.file_name().unwrap_or_default();
+        let name = Path::new(directory).join(name);
+        let name = name.to_string_lossy();
+        let mut record = options.of_image(&name, &sha256_of(input)?);
+        if self.input_scale.choice == InputScale::Auto
+            && let Some(sequence) = scales.sequence(input)
+        {
+            record.add("sequence", sequence);
+        }
+        Ok(record)
+    }
+
     /// Denoises one image if its output is due, and writes its preview. Returns the number of negative
     /// samples, which were set to 0.
-    fn image(&self, work: &Work, job: &Job, exposure: Option<f64>) -> anyhow::Result<usize> {
+    fn image(
+        &self,
+        work: &Work,
+        job: &Job,
+        record: &Record,
+        exposure: Option<f64>,
+    ) -> anyhow::Result<usize> {
         let Work {
             bundle,
             layouts,
@@ -231,33 +255,43 @@ impl Arguments {
         let say = |choice: &str| progress.line(format_args!("note: {name}: {choice}"));
         let layout = &layouts.of(&file, bundle, say)?;
         let clamped = if job.is_due {
-            self.denoise(work, job, file, layout, exposure)?
+            let prepared = Prepared {
+                file,
+                layout,
+                record,
+                exposure,
+            };
+            self.denoise(work, job, prepared)?
         } else {
             0
         };
+        let beside = job.output.with_extension("png");
+        if job.is_due && !self.png && preview::is_own(&beside) {
+            let beside = beside.display();
+            progress.line(format_args!(
+                "note: {beside} shows the replaced image; --png makes it again"
+            ));
+        }
         if let Some(path) = &job.preview {
             preview::write(path, &job.output, layout, self.exposure)?;
         }
         Ok(clamped)
     }
 
-    /// Denoises one image with the factor for `exposure`, by default its own. Returns the number of negative
-    /// samples, which were set to 0.
-    fn denoise(
-        &self,
-        work: &Work,
-        job: &Job,
-        file: ExrFile,
-        layout: &ChannelLayout,
-        exposure: Option<f64>,
-    ) -> anyhow::Result<usize> {
+    /// Denoises one image. Returns the number of negative samples, which were set to 0.
+    fn denoise(&self, work: &Work, job: &Job, prepared: Prepared) -> anyhow::Result<usize> {
         let Work {
             bundle,
             progress,
             warnings,
-            record,
             ..
         } = work;
+        let Prepared {
+            file,
+            layout,
+            record,
+            exposure,
+        } = prepared;
         let name = job.input.display();
         let names = self.layers.names(&file, layout)?;
         let mut file = file.keeping(&layout.color, cache_bytes());
@@ -302,13 +336,21 @@ impl Arguments {
             let error = described(&error);
             progress.line(format_args!("note: {name}: {error}"));
         }
+        if !job.replaces && job.output.exists() {
+            let output = job.output.display();
+            anyhow::bail!(
+                "{output} was written by another program meanwhile; --overwrite replaces it"
+            );
+        }
         let image = &denoised.color_hdr;
         EnergyBias::of(&frame, image)
             .warning()
             .iter()
             .for_each(warn);
         let mut planes = denoised.color_hdr;
-        planes.extend(denoised.alpha.into_iter().flatten());
+        // Alpha that is not denoised stays as it is in the file, unless it was repaired.
+        let repaired_alpha = || frame.alpha.clone().filter(|_| repaired > 0);
+        planes.extend(denoised.alpha.or_else(repaired_alpha).into_iter().flatten());
         planes.extend(denoised.layers);
         let replaced = Replaced {
             layout,
@@ -317,7 +359,7 @@ impl Arguments {
         };
         for note in self
             .output_flags
-            .write(&mut file, &job.output, &replaced, record)?
+            .write(&mut file, &job.output, &replaced, &record.text())?
         {
             progress.line(format_args!("note: {name}: {note}"));
         }
@@ -349,50 +391,4 @@ impl Arguments {
             repaired: repaired + more,
         })
     }
-}
-
-/// Largest distance of a frame's exposure from that of its sequence without a warning, in stops (ours).
-const MOST_STOPS: f64 = 2.0;
-
-/// A warning about a frame whose exposure is far from the one that its factor is made for.
-fn far_from_sequence(frame: &Frame, exposure: Option<f64>) -> Option<Warning> {
-    let expected = exposure.filter(|exposure| *exposure > 0.0)?;
-    let stops = (ranges::exposure(&frame.color) / expected).log2();
-    // A black frame is at infinity.
-    (stops.is_finite() && stops.abs() > MOST_STOPS).then(|| Warning {
-        what: "exposure".into(),
-        found: format!("it is {stops:+.1} stops from that of the frames around it"),
-        cause: "the factor of a sequence changes slowly; denoise such a frame by its own name",
-    })
-}
-
-/// The error at seams, in words.
-fn described(error: &SeamError) -> String {
-    let SeamError {
-        relmse,
-        largest,
-        windows,
-    } = error;
-    format!(
-        "error at seams, from {windows} windows denoised exactly: RelMSE {relmse:.2e}, \
-         largest difference {largest:.2e} of the largest value"
-    )
-}
-
-/// What all images of a command share.
-struct Work<'a> {
-    bundle: Bundle,
-    layouts: Layouts<'a>,
-    /// Of each output's header.
-    record: String,
-    progress: Progress,
-    warnings: Warnings,
-}
-
-/// What is denoised of a file.
-struct Contents {
-    frame: Frame,
-    layers: Vec<Layer>,
-    /// Number of samples that were repaired.
-    repaired: usize,
 }

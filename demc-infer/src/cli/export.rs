@@ -1,6 +1,7 @@
 //! `demc-infer export`: writes a model as one file for other programs.
 
 use std::env;
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
@@ -34,14 +35,14 @@ const NO_FILTER: &str = "none";
 #[command(after_help = "Examples:
   demc-infer export --model runs/demc -o demc.safetensors
   demc-infer export --model runs/demc --names torch --precision f16 -o demc-torch.safetensors
-  demc-infer export --model runs/demc --format onnx --verify -o demc.onnx
+  demc-infer export --model runs/demc --verify -o demc.onnx
   demc-infer export --model runs/demc --albedo-filter runs/albedo -o demc-filtered.safetensors")]
 pub struct Arguments {
     #[command(flatten)]
     model: ModelFlag,
-    /// File format
-    #[arg(long, value_enum, default_value = "safetensors")]
-    format: Format,
+    /// File format [default: onnx for FILE.onnx, otherwise safetensors]
+    #[arg(long, value_enum)]
+    format: Option<Format>,
     /// Names of the tensors in a safetensors file: Burn's, or those that PyTorch's load_state_dict
     /// expects
     #[arg(long, value_enum, default_value = "burn")]
@@ -94,6 +95,7 @@ enum PrecisionFlag {
 
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
+        let format = self.format()?;
         // Rounding to f16 cannot be undone, so an export must not replace its model.
         let mut outputs = Outputs::default();
         self.model.protect(&mut outputs);
@@ -117,7 +119,7 @@ impl Arguments {
             NamesFlag::Burn => Names::Burn,
             NamesFlag::Torch => Names::Torch,
         };
-        if self.format == Format::Onnx && names == Names::Torch {
+        if format == Format::Onnx && names == Names::Torch {
             return Err(UsageError("--names is for safetensors only".into()).into());
         }
         let precision = match self.precision {
@@ -135,7 +137,7 @@ impl Arguments {
             bundle.meta.layout = layout.map_err(|error| UsageError(error.to_string()))?;
         }
         let output = printable(&self.output.display().to_string());
-        match self.format {
+        match format {
             Format::Safetensors => {
                 bundle.export(&self.output, names, precision)?;
                 let tensors = bundle.tensors(names).len();
@@ -149,19 +151,39 @@ impl Arguments {
             }
         }
         if self.verify {
-            self.verify(&bundle.rounded(precision)?)
+            self.verify(format, &bundle.rounded(precision)?)
         } else {
             Ok(())
         }
     }
 
+    /// The format that the flag or the name of the file asks for.
+    fn format(&self) -> Result<Format, UsageError> {
+        let output = self.output.display();
+        let extension = self.output.extension().and_then(OsStr::to_str);
+        let named = match extension.map(str::to_ascii_lowercase).as_deref() {
+            Some("onnx") => Some(Format::Onnx),
+            Some("safetensors") => Some(Format::Safetensors),
+            _ => None,
+        };
+        match (self.format, named) {
+            _ if self.output == Path::new("-") => {
+                Err(UsageError("-o -: give the name of a file".into()))
+            }
+            (Some(format), Some(named)) if format != named => Err(UsageError(format!(
+                "-o {output}: its name says another format than --format"
+            ))),
+            (format, named) => Ok(format.or(named).unwrap_or(Format::Safetensors)),
+        }
+    }
+
     /// Runs the file and prints its deviation from `expected`.
-    fn verify(&self, expected: &Bundle) -> anyhow::Result<()> {
+    fn verify(&self, format: Format, expected: &Bundle) -> anyhow::Result<()> {
         let python = match &self.python {
             Some(python) => python.clone(),
             None => env::var_os(PYTHON_VARIABLE).map_or_else(|| "python3".into(), PathBuf::from),
         };
-        let runtime = match self.format {
+        let runtime = match format {
             Format::Onnx => Runtime::OnnxRuntime,
             Format::Safetensors => Runtime::PyTorch,
         };

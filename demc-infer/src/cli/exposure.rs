@@ -1,7 +1,7 @@
 //! `--input-scale`: the factor on the colour before the network.
 
 use std::collections::HashMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use clap::Args;
@@ -9,7 +9,7 @@ use demc_data::image::exr::ExrFile;
 use demc_data::input::ranges::exposure;
 
 use super::exposure_curve::ExposureCurve;
-use super::inputs::Sequence;
+use super::inputs::{Place, Sequence, place};
 use super::layouts::Layouts;
 use crate::Bundle;
 use crate::denoise::MAX_INPUT_SCALE;
@@ -75,24 +75,42 @@ impl FromStr for InputScale {
 /// The factors of the frames of sequences.
 pub struct SequenceScales<'a> {
     sequences: &'a [Sequence],
+    /// The sequence and the index of each frame, by its place.
+    places: HashMap<Place, (usize, usize)>,
     /// By the index of the sequence.
     curves: HashMap<usize, ExposureCurve>,
 }
 
 impl<'a> SequenceScales<'a> {
     pub fn new(sequences: &'a [Sequence]) -> Self {
+        let frames = sequences.iter().enumerate().flat_map(|(index, sequence)| {
+            let frames = sequence.frames.iter().enumerate();
+            frames.map(move |(frame, (_, file))| (place(file), (index, frame)))
+        });
         Self {
             sequences,
+            places: frames.collect(),
             curves: HashMap::new(),
         }
+    }
+
+    /// Names the first and the last frame of the sequence of an image, which decide its factor.
+    pub fn sequence(&self, path: &Path) -> Option<String> {
+        let (index, _) = self.places.get(&place(path))?;
+        let frames = &self.sequences[*index].frames;
+        let name = |(_, file): &(u64, PathBuf)| {
+            let name = file.file_name().unwrap_or_default();
+            name.to_string_lossy().into_owned()
+        };
+        let count = frames.len();
+        let ends = [frames.first()?, frames.last()?].map(name);
+        Some(format!("{} to {} ({count} frames)", ends[0], ends[1]))
     }
 
     /// The exposure that the factor for a frame is made for, which hardly changes from frame to frame; `None` for
     /// an image in no sequence.
     pub fn exposure(&mut self, path: &Path, bundle: &Bundle, layouts: &Layouts) -> Option<f64> {
-        let place = |sequence: &Sequence| sequence.frames.iter().position(|(_, file)| file == path);
-        let mut sequences = self.sequences.iter().enumerate();
-        let (index, frame) = sequences.find_map(|(i, sequence)| Some((i, place(sequence)?)))?;
+        let &(index, frame) = self.places.get(&place(path))?;
         let frames = &self.sequences[index].frames;
         let curve = self.curves.entry(index).or_insert_with(|| {
             let numbers: Vec<u64> = frames.iter().map(|(number, _)| *number).collect();

@@ -1,7 +1,8 @@
 //! The exposure of a sequence over its frames, smooth enough that a factor from it does not flicker.
 //!
 //! Few frames are measured. More are measured where neighbouring measurements differ, so that a fade or a cut
-//! between them is found. A single bright frame, such as a flash, is left out. The curve is linear between the
+//! between them is found. A single bright frame, such as a flash, is left out, and so are frames that are
+//! nearly black. The curve is linear between the
 //! measured frames, and changes by at most [`MOST_PER_FRAME`]. It depends on the whole sequence alone, not on
 //! the frames that one worker of a farm denoises.
 
@@ -15,6 +16,10 @@ const FIRST: usize = 9;
 const MOST: usize = 48;
 /// Difference of neighbouring measurements above which a frame between them is measured, in stops.
 const FINE: f64 = 0.5;
+
+/// Stops below the upper quartile of the measurements from which on a frame counts as black (ours: no factor
+/// makes such a frame visible beside the others).
+const BLACK: f64 = 14.0;
 
 /// Exposure by frame, in stops.
 #[derive(Debug)]
@@ -33,11 +38,13 @@ impl ExposureCurve {
             let index = part * last / (FIRST.min(numbers.len()) - 1).max(1);
             found.entry(index).or_insert_with(|| measure(index));
         }
+        forget_black(&mut found);
         while found.len() < MOST
             && let Some(index) = coarsest(&found)
         {
             let stops = measure(index);
             found.insert(index, stops);
+            forget_black(&mut found);
         }
         let known: Vec<(f64, f64)> = found
             .into_iter()
@@ -69,6 +76,19 @@ impl ExposureCurve {
         }
         let share = ((frame - left.0) / length).clamp(0.0, 1.0);
         Some(left.1 + share * (right.1 - left.1))
+    }
+}
+
+/// Makes measurements far below the others `None`, as those of black frames are.
+fn forget_black(found: &mut BTreeMap<usize, Option<f64>>) {
+    let mut stops: Vec<f64> = found.values().copied().flatten().collect();
+    stops.sort_by(f64::total_cmp);
+    // The brightest may be flashes and fireflies.
+    let Some(bright) = stops.get(stops.len() * 3 / 4).copied() else {
+        return;
+    };
+    for stops in found.values_mut() {
+        stops.take_if(|stops| *stops < bright - BLACK);
     }
 }
 
@@ -147,6 +167,11 @@ mod tests {
         let mut dark = vec![2.0; 30];
         dark[0] = f64::NAN;
         assert_eq!(curve(&dark).0.at(1), Some(2.0));
+        // The last frames are nearly black, the others keep their exposure.
+        let mut end = vec![2.0; 40];
+        end[36..].fill(-36.0);
+        let (found, _) = curve(&end);
+        assert!((1..=36).all(|frame| found.at(frame) == Some(2.0)));
         assert_eq!(curve(&[f64::NAN; 3]).0.at(1), None);
         assert_eq!(curve(&[]).0.at(1), None);
         assert_eq!(curve(&[3.0]).0.at(9), Some(3.0));

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use demc_program::exit::UsageError;
 use demc_program::message;
+use demc_program::output::Outputs;
 
 use super::frames::Frames;
 
@@ -20,7 +21,7 @@ pub struct Inputs {
     pub several: bool,
     /// The frame sequences among the arguments.
     pub sequences: Vec<Sequence>,
-    /// Says which directories, patterns, and sequences have no images.
+    /// Says which directories, patterns, and sequences have no images, or cannot be read.
     pub empty: Vec<String>,
 }
 
@@ -46,17 +47,18 @@ impl Inputs {
     /// - Names with `*`, `?` or `[..]` are glob patterns if no such file exists.
     ///
     /// # Errors
-    /// A directory that cannot be read; a pattern that cannot be understood; `frames` without a sequence.
+    /// A pattern that cannot be understood; `frames` without a sequence.
     pub fn expand(arguments: &[PathBuf], frames: Option<&Frames>) -> Result<Self, UsageError> {
         let mut files = Vec::new();
         let mut several = arguments.len() > 1;
         let (mut sequences, mut empty) = (Vec::new(), Vec::new());
         for argument in arguments {
+            let mut unreadable = Vec::new();
             let found = if argument.is_file() {
                 vec![argument.clone()]
             } else if argument.is_dir() {
                 several = true;
-                directory(argument)?
+                readable(directory(argument), &mut unreadable)
             } else if let Some(field) = padded_with_spaces(argument) {
                 return Err(UsageError(format!(
                     "{}: {field} pads numbers with spaces; write %0{}",
@@ -65,18 +67,24 @@ impl Inputs {
                 )));
             } else if let Some(pattern) = SequencePattern::parse(argument) {
                 several = true;
-                let sequence = pattern.expand(frames)?;
-                let files = sequence.files.clone();
-                sequences.push(sequence);
-                files
+                match pattern.expand(frames)? {
+                    Ok(sequence) => {
+                        let files = sequence.files.clone();
+                        sequences.push(sequence);
+                        files
+                    }
+                    Err(error) => readable(Err(error), &mut unreadable),
+                }
             } else if is_pattern(argument) {
                 several = true;
-                pattern(argument)?
+                pattern(argument, &mut unreadable)?
             } else {
                 // Reading the file gives the best error.
                 vec![argument.clone()]
             };
-            if found.is_empty() {
+            if !unreadable.is_empty() {
+                empty.append(&mut unreadable);
+            } else if found.is_empty() {
                 empty.push(format!(
                     "{}: no images found{}",
                     argument.display(),
@@ -97,6 +105,15 @@ impl Inputs {
             sequences,
             empty,
         })
+    }
+
+    /// Protects all images, also those that other shards or frames are made of, from being replaced.
+    pub fn protect(&self, outputs: &mut Outputs) {
+        let frames = self.sequences.iter().flat_map(|sequence| &sequence.frames);
+        let frames = frames.map(|(_, file)| file);
+        for file in self.files.iter().chain(frames) {
+            outputs.protect(file, &format!("the input {}", file.display()));
+        }
     }
 
     /// Reports arguments without images and missing frames of sequences, and notes those after their ends.
@@ -120,7 +137,10 @@ impl Inputs {
 }
 
 /// Where a file is: its directory without links, and its name. Two links to one file have two places.
-fn place(file: &Path) -> (PathBuf, OsString) {
+pub type Place = (PathBuf, OsString);
+
+/// The place of a file.
+pub fn place(file: &Path) -> Place {
     let parent = match file.parent() {
         Some(parent) if parent != Path::new("") => parent,
         _ => Path::new("."),
@@ -144,7 +164,15 @@ fn hint(argument: &Path) -> String {
     }
 }
 
-fn directory(path: &Path) -> Result<Vec<PathBuf>, UsageError> {
+/// The files, or none and the error in `unreadable`.
+fn readable(found: Result<Vec<PathBuf>, String>, unreadable: &mut Vec<String>) -> Vec<PathBuf> {
+    found.unwrap_or_else(|error| {
+        unreadable.push(error);
+        Vec::new()
+    })
+}
+
+fn directory(path: &Path) -> Result<Vec<PathBuf>, String> {
     let mut files: Vec<PathBuf> = entries(path)?
         .into_iter()
         // Reading anything but a file gives the best error.
@@ -154,8 +182,8 @@ fn directory(path: &Path) -> Result<Vec<PathBuf>, UsageError> {
     Ok(files)
 }
 
-fn entries(path: &Path) -> Result<Vec<PathBuf>, UsageError> {
-    let error = |error| UsageError(format!("{}: {error}", path.display()));
+fn entries(path: &Path) -> Result<Vec<PathBuf>, String> {
+    let error = |error| format!("{}: {error}", path.display());
     let entries = fs::read_dir(path).map_err(error)?;
     let paths = entries.map(|entry| entry.map(|entry| entry.path()));
     paths.collect::<Result<_, _>>().map_err(error)
@@ -176,7 +204,8 @@ fn is_pattern(path: &Path) -> bool {
     bytes.iter().any(|byte| b"*?[".contains(byte))
 }
 
-fn pattern(argument: &Path) -> Result<Vec<PathBuf>, UsageError> {
+/// The files that match; directories that cannot be read go to `unreadable`.
+fn pattern(argument: &Path, unreadable: &mut Vec<String>) -> Result<Vec<PathBuf>, UsageError> {
     let error =
         |error: &dyn std::fmt::Display| UsageError(format!("{}: {error}", argument.display()));
     let Some(text) = argument.to_str() else {
@@ -184,20 +213,40 @@ fn pattern(argument: &Path) -> Result<Vec<PathBuf>, UsageError> {
             &"a pattern must be UTF-8; name the directory instead",
         ));
     };
-    let options = glob::MatchOptions {
-        // As in a shell.
-        require_literal_leading_dot: true,
-        ..glob::MatchOptions::new()
-    };
-    let found = glob::glob_with(text, options).map_err(|source| error(&source))?;
+    let found = glob::glob(text).map_err(|source| error(&source))?;
     let mut files = Vec::new();
     for path in found {
-        let path = path.map_err(|source| error(&source))?;
-        if !path.is_dir() {
+        let path = match path {
+            Ok(path) => path,
+            Err(source) => {
+                unreadable.push(format!("{}: {}", source.path().display(), source.error()));
+                continue;
+            }
+        };
+        if !path.is_dir() && !has_hidden(&path, argument) {
             files.push(path);
         }
     }
     Ok(files)
+}
+
+/// Whether a path has a hidden component that no component of the pattern asks for by its first dot. As in
+/// a shell; the crate's own option panics at names that are not UTF-8.
+fn has_hidden(path: &Path, pattern: &Path) -> bool {
+    let dotted = |path: &Path| {
+        let names = path.components().map(|part| part.as_os_str().to_owned());
+        let hidden = names.filter(|name| name.as_encoded_bytes().starts_with(b"."));
+        let hidden = hidden.filter(|name| name != "." && name != "..");
+        hidden.collect::<Vec<OsString>>()
+    };
+    let asked: Vec<glob::Pattern> = dotted(pattern)
+        .iter()
+        .filter_map(|name| glob::Pattern::new(name.to_str()?).ok())
+        .collect();
+    dotted(path).iter().any(|name| {
+        let name = name.to_string_lossy();
+        !asked.iter().any(|pattern| pattern.matches(&name))
+    })
 }
 
 /// The name of a frame sequence: `directory/PREFIX####SUFFIX`.
@@ -221,12 +270,20 @@ impl<'a> SequencePattern<'a> {
         })
     }
 
-    fn expand(&self, frames: Option<&Frames>) -> Result<Sequence, UsageError> {
+    /// The sequence, or why its directory cannot be read.
+    ///
+    /// # Errors
+    /// None of the chosen frames exists.
+    fn expand(&self, frames: Option<&Frames>) -> Result<Result<Sequence, String>, UsageError> {
         let parent = match self.argument.parent() {
             Some(parent) if parent != Path::new("") => parent,
             _ => Path::new("."),
         };
-        let mut found: Vec<(u64, PathBuf)> = entries(parent)?
+        let files = match entries(parent) {
+            Ok(files) => files,
+            Err(error) => return Ok(Err(error)),
+        };
+        let mut found: Vec<(u64, PathBuf)> = files
             .into_iter()
             .filter_map(|path| Some((self.number(path.file_name()?.to_str()?)?, path)))
             .collect();
@@ -260,12 +317,12 @@ impl<'a> SequencePattern<'a> {
                 )
             });
         }
-        Ok(Sequence {
+        Ok(Ok(Sequence {
             files: found.into_iter().map(|(_, path)| path).collect(),
             frames: all_found,
             missing,
             after,
-        })
+        }))
     }
 
     /// The frame number in a file name: exactly `digits` digits, or more without a leading zero.

@@ -23,6 +23,8 @@ pub struct Job {
     pub output: PathBuf,
     /// Whether the output is to be written; otherwise it is finished.
     pub is_due: bool,
+    /// Whether the command may replace a file at the output's path.
+    pub replaces: bool,
     /// The preview to write, if there is to be one.
     pub preview: Option<PathBuf>,
 }
@@ -56,27 +58,30 @@ enum Existing {
 impl Existing {
     /// The file at an output's path. Files are written atomically, so a file of this program is complete
     /// unless another one cut it.
-    fn output(job: &Job, record: &Record) -> Self {
+    ///
+    /// An input that cannot be read is reported when its turn comes.
+    fn output(job: &Job, record: Option<Record>) -> Self {
         let Job { input, output, .. } = job;
-        if !output.exists() {
-            return Self::Replaceable;
-        }
         let opened = ExrFile::open(output).and_then(|mut file| {
             file.check_whole()?;
             Ok(file)
         });
         let then = match opened {
             Ok(file) => file.attribute(RECORD).and_then(|text| Record::parse(&text)),
+            Err(demc_data::Error::File(error)) => {
+                return Self::Other(format!("and cannot be read: {error}"));
+            }
             Err(_) => return Self::Other("damaged, or not an EXR file".into()),
         };
         let Some(then) = then else {
             return Self::Other("not written by this program".into());
         };
-        if is_newer(input, output) {
+        let Some(record) = record else {
             return Self::Replaceable;
-        }
+        };
         match record.differences(&then) {
             same if same.is_empty() => Self::Finished,
+            _ if record.differs_in_content(&then) && is_newer(input, output) => Self::Replaceable,
             options => Self::Other(format!("made with {options}")),
         }
     }
@@ -86,19 +91,22 @@ impl Existing {
         if !preview.exists() {
             return Self::Replaceable;
         }
-        match preview::exposure_of(preview) {
-            None => Self::Other("not written by this program".into()),
-            Some(then) if job.is_due || then != exposure.to_string() => Self::Replaceable,
-            Some(_) if is_newer(&job.output, preview) => Self::Replaceable,
-            Some(_) => Self::Finished,
+        if !preview::is_own(preview) {
+            return Self::Other("not written by this program".into());
+        }
+        let shown = preview::Shown::now(&job.output, exposure).ok();
+        if !job.is_due && shown.is_some() && preview::shown(preview) == shown {
+            Self::Finished
+        } else {
+            Self::Replaceable
         }
     }
 }
 
-/// Whether a file was changed after another one.
+/// Whether a file was changed after another one, or in the same tick of the clock.
 fn is_newer(file: &Path, than: &Path) -> bool {
     let modified = |path: &Path| fs::metadata(path).and_then(|found| found.modified());
-    modified(than).is_ok_and(|than| modified(file).is_ok_and(|file| file > than))
+    modified(than).is_ok_and(|than| modified(file).is_ok_and(|file| file >= than))
 }
 
 impl Jobs {
@@ -106,7 +114,8 @@ impl Jobs {
     /// read.
     ///
     /// # Errors
-    /// Two inputs with the same output; several for one file; a file that is not named as an EXR file.
+    /// A single input that does not exist; two inputs with the same output; several for one file; a file that is
+    /// not named as an EXR file.
     pub fn new(inputs: &Inputs, output: &Path, previews: bool) -> Result<Self, UsageError> {
         let named_as_directory = output
             .as_os_str()
@@ -122,6 +131,10 @@ impl Jobs {
         }
         let extension = output.extension().and_then(OsStr::to_str);
         if !directory && !extension.is_some_and(|found| found.eq_ignore_ascii_case("exr")) {
+            if let Some(input) = inputs.files.iter().find(|input| !input.exists()) {
+                // It may have been meant as a pattern, whose outputs go to a directory.
+                return Err(UsageError(format!("{}: no such file", input.display())));
+            }
             return Err(UsageError(format!(
                 "-o {}: an output is an EXR file, named NAME.exr, or a directory, named DIR/; --png writes a preview \
                  beside it",
@@ -151,6 +164,7 @@ impl Jobs {
                 preview: previews.then(|| output.with_extension("png")),
                 output,
                 is_due: true,
+                replaces: true,
             });
         }
         Ok(Self {
@@ -176,10 +190,6 @@ impl Jobs {
     /// # Errors
     /// An output or preview that is an input or another output.
     pub fn claim(&self, outputs: &mut Outputs) -> Result<(), OutputError> {
-        for job in &self.list {
-            let what = format!("the input {}", job.input.display());
-            outputs.protect(&job.input, &what);
-        }
         let mut files = self
             .list
             .iter()
@@ -188,10 +198,21 @@ impl Jobs {
     }
 
     /// Removes what is finished, and existing files that the command may not replace, also from `outputs`. An
-    /// output that this program wrote is made again if its input is newer.
-    pub fn skip_existing(&mut self, record: &Record, exposure: f32, outputs: &mut Outputs) {
+    /// output that this program wrote is made again if its input has changed since then. `record` is that of an
+    /// input, if it can be read.
+    pub fn skip_existing(
+        &mut self,
+        record: impl Fn(&Path) -> Option<Record>,
+        exposure: f32,
+        outputs: &mut Outputs,
+    ) {
         for mut job in std::mem::take(&mut self.list) {
-            let found = Existing::output(&job, record);
+            let found = if job.output.exists() {
+                Existing::output(&job, record(&job.input))
+            } else {
+                job.replaces = false;
+                Existing::Replaceable
+            };
             if found != Existing::Replaceable {
                 outputs.release(&job.output);
                 job.is_due = false;

@@ -1,5 +1,7 @@
 //! `--layers`: further channels of a file that are denoised beside its colour.
 
+use std::collections::BTreeSet;
+
 use clap::Args;
 use demc_data::image::exr::ExrFile;
 use demc_data::image::frame::layers::{check_layers, decode_layers};
@@ -28,9 +30,12 @@ fn pattern(text: &str) -> Result<Pattern, String> {
 impl LayersFlag {
     /// Adds the patterns to a record.
     pub fn record(&self, record: &mut Record) {
-        let patterns: Vec<&str> = self.patterns.iter().map(Pattern::as_str).collect();
-        if !patterns.is_empty() {
-            record.add("--layers", patterns.join(" "));
+        // A set: the order changes nothing. Its text shows where a pattern ends.
+        let patterns: BTreeSet<&str> = self.patterns.iter().map(Pattern::as_str).collect();
+        match Vec::from_iter(&patterns)[..] {
+            [] => {}
+            [pattern] => record.add("--layers", pattern),
+            _ => record.add("--layers", format!("{patterns:?}")),
         }
     }
 

@@ -7,6 +7,7 @@ use clap::Args;
 use demc_data::image::exr::ExrFile;
 use demc_data::image::layout::{FeatureBuffer, FileLayout, Missing, detect};
 use demc_data::{ChannelLayout, Dataset, Error};
+use demc_program::checksum::sha256;
 use demc_program::exit::UsageError;
 use demc_program::message;
 use demc_program::output::Outputs;
@@ -46,15 +47,6 @@ impl LayoutFlags {
         }
     }
 
-    /// Adds these flags to a record.
-    pub fn record(&self, record: &mut Record) {
-        for (flag, value) in [("--layout", &self.layout), ("--layer", &self.layer)] {
-            if let Some(value) = value {
-                record.add(flag, value);
-            }
-        }
-    }
-
     /// Reads the layout of `--layout`.
     ///
     /// # Errors
@@ -67,13 +59,28 @@ impl LayoutFlags {
             .transpose();
         Ok(Layouts {
             flags: self,
-            given: given.map_err(|error| UsageError(error.to_string()))?,
+            given: given
+                .map_err(|error| UsageError(format!("{:#}", anyhow::Error::from(error))))?,
             said: RefCell::default(),
         })
     }
 }
 
 impl Layouts<'_> {
+    /// Adds the flags to a record, and the channels of a given layout.
+    pub fn record(&self, record: &mut Record) {
+        let LayoutFlags { layout, layer } = self.flags;
+        for (flag, value) in [("--layout", layout), ("--layer", layer)] {
+            if let Some(value) = value {
+                record.add(flag, value);
+            }
+        }
+        if let Some(given) = &self.given {
+            let text = serde_json::to_string(given).expect("a layout is plain data");
+            record.add("channels", sha256([text.as_bytes()]));
+        }
+    }
+
     /// The layout of `file`, with the names of its view layer. A choice among the presets is
     /// passed to `say`, once for all files.
     ///

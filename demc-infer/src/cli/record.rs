@@ -10,9 +10,15 @@ use serde::{Deserialize, Serialize};
 #[serde(transparent)]
 pub struct Record(BTreeMap<String, String>);
 
-/// The key of the model's checksum. The model's name is for messages alone: one model may have several.
-const WEIGHTS: &str = "weights";
-const MODEL: &str = "--model";
+/// Checksums of contents, each with the key of its name and what a message calls other content. Names are
+/// for messages alone: one content may have several.
+const CONTENTS: [(&str, &str, &str); 3] = [
+    ("weights", "--model", "other weights of"),
+    ("channels", "--layout", "other channels of"),
+    (IMAGE, INPUT, "other content of"),
+];
+const IMAGE: &str = "image";
+const INPUT: &str = "input";
 
 /// The value of a flag that was not given.
 const DEFAULT: &str = "the default";
@@ -21,9 +27,29 @@ impl Record {
     /// A record of a model, by its name and the checksum of its weights.
     pub fn of_model(name: &str, weights: &str) -> Self {
         let mut record = Self::default();
-        record.add(MODEL, name);
-        record.add(WEIGHTS, weights);
+        record.add("--model", name);
+        record.add("weights", weights);
         record
+    }
+
+    /// The same record for an image, by the name and the checksum of its file.
+    #[must_use]
+    pub fn of_image(&self, name: &str, checksum: &str) -> Self {
+        let mut record = self.clone();
+        record.add(INPUT, name);
+        record.add(IMAGE, checksum);
+        record
+    }
+
+    /// Whether `then` differs in the image's content alone: the file was written again.
+    pub fn differs_in_content(&self, then: &Self) -> bool {
+        let without = |record: &Self| {
+            let mut record = record.clone();
+            record.0.remove(IMAGE);
+            record
+        };
+        without(self).differences(&without(then)).is_empty()
+            && self.0.get(INPUT) == then.0.get(INPUT)
     }
 
     /// Adds a flag that was given.
@@ -62,20 +88,18 @@ impl Record {
         let flags: BTreeSet<&String> = self.0.keys().chain(then.0.keys()).collect();
         let mut found = Vec::new();
         for flag in flags {
-            let (now, before) = (value(self, flag), value(then, flag));
-            match flag.as_str() {
-                MODEL => {}
-                WEIGHTS if now != before => {
-                    let (now, before) = (value(self, MODEL), value(then, MODEL));
-                    found.push(if now == before {
-                        format!("other weights of {MODEL} {now}")
-                    } else {
-                        format!("{MODEL} {before} instead of {now}")
-                    });
-                }
-                _ if now != before => found.push(format!("{flag} {before} instead of {now}")),
-                _ => {}
+            let content = CONTENTS.iter().find(|(sum, ..)| sum == flag);
+            if value(self, flag) == value(then, flag)
+                || CONTENTS.iter().any(|(_, name, _)| name == flag)
+            {
+                continue;
             }
+            let name = content.map_or(flag.as_str(), |(_, name, _)| name);
+            let (now, before) = (value(self, name), value(then, name));
+            found.push(match content {
+                Some((.., other)) if now == before => format!("{other} {name} {now}"),
+                _ => format!("{name} {before} instead of {now}"),
+            });
         }
         found.join(", ")
     }
@@ -107,7 +131,16 @@ mod tests {
         );
         let named = Record::of_model("modèle \u{1f600}", "4d");
         assert!(named.text().is_ascii());
-        for record in [layers, named] {
+        let image = quality.of_image("a.exr", "5e");
+        assert_eq!(image.differences(&quality.of_image("b.exr", "5e")), "");
+        let other = quality.of_image("b.exr", "6f");
+        assert_eq!(image.differences(&other), "input b.exr instead of a.exr");
+        assert!(!image.differs_in_content(&other));
+        let again = quality.of_image("a.exr", "6f");
+        assert_eq!(image.differences(&again), "other content of input a.exr");
+        assert!(image.differs_in_content(&again));
+        assert!(!image.differs_in_content(&fast.of_image("a.exr", "6f")));
+        for record in [layers, named, image] {
             assert_eq!(Record::parse(&record.text()), Some(record));
         }
         assert_eq!(Record::parse("painted by hand"), None);

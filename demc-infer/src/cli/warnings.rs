@@ -43,11 +43,11 @@ impl Warnings {
     pub fn rest(self) -> Vec<String> {
         let kinds = self.kinds.into_inner().into_iter();
         let repeated = kinds.filter(|kind| !kind.more.is_empty());
-        let line = |Kind { what, more, .. }: Kind| {
+        let line = |Kind { what, cause, more }: Kind| {
             let count = more.len();
             let dots = if count > MAX_NAMES { ", ..." } else { "" };
             let names = more[..count.min(MAX_NAMES)].join(", ");
-            format!("{what}: the same in {count} more images: {names}{dots}")
+            format!("{what} ({cause}): the same in {count} more images: {names}{dots}")
         };
         repeated.map(line).collect()
     }
@@ -75,7 +75,7 @@ mod tests {
         assert_eq!(first("s/3.exr", warning("normal", "its length is 2")), None);
         assert_eq!(
             warnings.rest(),
-            ["normal: the same in 2 more images: 2.exr, 3.exr"]
+            ["normal (is it another buffer?): the same in 2 more images: 2.exr, 3.exr"]
         );
     }
 }

@@ -132,7 +132,6 @@ impl Bundle {
         input.ensemble = ensemble;
         input.scale = scale;
         let observer: &mut DenoiseObserver = &mut observer;
-        input.filter_albedo(tiling, observer)?;
         let size = Padding {
             height: frame.height,
             width: frame.width,
@@ -143,6 +142,7 @@ impl Bundle {
                 name: frame.name.clone(),
                 source,
             })?;
+        input.filter_albedo(tiling, observer)?;
         input.layers = layers;
         let mut color_hdr = input.denoise(&tiles, observer)?;
         let mut layer_planes = color_hdr.split_off(COLOR_CHANNELS * pixels);

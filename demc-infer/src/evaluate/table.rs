@@ -87,9 +87,13 @@ fn escaped(name: &str) -> String {
 
 /// Aligned rows with a rule under the first. The first column is left-aligned, the others
 /// right-aligned.
+/// Largest width of a column that shorter cells are filled up to (ours; names of scenes have no limit).
+const MAX_COLUMN: usize = 200;
+
 fn aligned(rows: &[Vec<String>]) -> String {
     let width = |column: usize| rows.iter().map(|r| r[column].chars().count()).max();
-    let widths: Vec<usize> = (0..rows[0].len()).filter_map(width).collect();
+    let widths = (0..rows[0].len()).filter_map(width);
+    let widths: Vec<usize> = widths.map(|width| width.min(MAX_COLUMN)).collect();
     let dashes = |(i, &width): (usize, &usize)| match i {
         0 => "-".repeat(width),
         _ => "-".repeat(width - 1) + ":",

@@ -184,7 +184,8 @@ pub fn verify(
     let runtime = run(file, runtime, python, folder.path())?;
     let mut deviations = Vec::with_capacity(SIZES.len());
     for ((i, size), expected) in SIZES.into_iter().enumerate().zip(outputs) {
-        let bytes = fs::read(folder.path().join(format!("{i}.output")))?;
+        // A program that is no Python interpreter writes nothing.
+        let bytes = fs::read(folder.path().join(format!("{i}.output"))).unwrap_or_default();
         let words = bytes.as_chunks().0.iter();
         let found: Vec<f32> = words.map(|word| f32::from_le_bytes(*word)).collect();
         if found.len() != expected.len() {

@@ -58,7 +58,7 @@ impl RunDir {
     ///
     /// # Errors
     /// A directory with a run that is not to be resumed, or with another run: each differing key is
-    /// named.
+    /// named. A directory without a run, but with a file of a run's name.
     pub fn claim(config: &Config, resume: bool) -> anyhow::Result<Self> {
         let path = config.run_dir().to_path_buf();
         let dir = RunDir {
@@ -67,6 +67,13 @@ impl RunDir {
         };
         let trace = OWN_FILES.iter().chain(&TRACES);
         let Some(trace) = trace.into_iter().find(|name| path.join(name).exists()) else {
+            if let Some(file) = replaced_files(&path).iter().find(|file| file.exists()) {
+                bail!(
+                    "{}: belongs to no run, and a run would replace it; move it, or name another directory \
+                     with --run-dir",
+                    file.display()
+                );
+            }
             return Ok(dir);
         };
         if let Some(saved) = dir.saved_config()? {
@@ -172,6 +179,7 @@ impl RunDir {
         match read_record(&path)? {
             StoredRecord::Intact(first) => {
                 first.check_data(&path, data)?;
+                first.check_patches(&path, &now)?;
                 notes.extend(first.version_note(&now));
                 return Ok(notes);
             }

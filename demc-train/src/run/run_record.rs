@@ -188,6 +188,22 @@ impl RunRecord {
         Ok(())
     }
 
+    /// Compares the patches of an epoch with those of the start.
+    ///
+    /// # Errors
+    /// Another number.
+    pub fn check_patches(&self, path: &Path, now: &RunRecord) -> anyhow::Result<()> {
+        ensure!(
+            self.patches == now.patches,
+            "{}: the run started with {} patches per epoch instead of {}; restore `repeat` in the manifest, or \
+             start a new run",
+            path.display(),
+            self.patches,
+            now.patches
+        );
+        Ok(())
+    }
+
     /// A note if `now` has other versions or another device.
     pub fn version_note(&self, now: &RunRecord) -> Option<String> {
         let versions = |record: &RunRecord| {

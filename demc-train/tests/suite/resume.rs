@@ -63,6 +63,24 @@ fn a_directory_with_another_run_is_refused() {
 }
 
 #[test]
+fn a_file_that_belongs_to_no_run_is_kept() {
+    let (_dir, config, run) = place();
+    for name in ["best.safetensors", "test.json", "strips/test.png"] {
+        let path = run.join(name);
+        fs::create_dir_all(path.parent().expect("a directory")).expect("a directory");
+        fs::write(&path, "mine").expect("written");
+        let error = error_line(&train(&config, &run, &["--set=train.steps=1"]), 1);
+        assert!(
+            error.contains(&format!("{name}: belongs to no run")),
+            "{error}"
+        );
+        assert_eq!(fs::read(&path).expect("kept"), b"mine");
+        fs::remove_file(&path).expect("removed");
+    }
+    trained(&config, &run, &["--set=train.steps=1"]);
+}
+
+#[test]
 fn missing_and_damaged_files_cost_at_most_one_checkpoint() {
     let dir = tempfile::tempdir().expect("a temporary directory");
     let config = config(dir.path());

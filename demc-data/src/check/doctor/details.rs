@@ -128,18 +128,55 @@ impl Details {
 
     /// The median over blocks of 16x16 pixels of the mean square.
     pub(super) fn median_square(&self) -> f64 {
-        const BLOCK: usize = 16;
+        self.median_of_blocks(|sums| Some(sums.squares / (BLOCK * BLOCK) as f64))
+    }
+
+    /// The correlation of a value with those beside and below it, the median over blocks that are not
+    /// flat: 0 for noise.
+    pub(super) fn neighbours(&self) -> f64 {
+        self.median_of_blocks(|sums| {
+            (sums.squares > FLAT).then(|| sums.products / (2.0 * sums.squares))
+        })
+    }
+
+    fn median_of_blocks(&self, value: impl Fn(BlockSums) -> Option<f64>) -> f64 {
         let (columns, rows) = (self.width / BLOCK, self.height / BLOCK);
-        let mut sums = vec![0.0; columns * rows];
-        for y in 0..rows * BLOCK {
-            for x in 0..columns * BLOCK {
-                let square = self.values[y * self.width + x].powi(2);
-                sums[y / BLOCK * columns + x / BLOCK] += square / (BLOCK * BLOCK) as f64;
+        let blocks = (0..rows * columns).map(|i| self.sums([i / columns, i % columns]));
+        let mut values: Vec<f64> = blocks.filter_map(value).collect();
+        values.sort_by(f64::total_cmp);
+        values.get(values.len() / 2).copied().unwrap_or(0.0)
+    }
+
+    fn sums(&self, [row, column]: [usize; 2]) -> BlockSums {
+        let mut sums = BlockSums::default();
+        let at =
+            |y: usize, x: usize| self.values[(row * BLOCK + y) * self.width + column * BLOCK + x];
+        for y in 0..BLOCK {
+            for x in 0..BLOCK {
+                sums.squares += at(y, x).powi(2);
+                if x + 1 < BLOCK {
+                    sums.products += at(y, x) * at(y, x + 1);
+                }
+                if y + 1 < BLOCK {
+                    sums.products += at(y, x) * at(y + 1, x);
+                }
             }
         }
-        sums.sort_by(f64::total_cmp);
-        sums.get(sums.len() / 2).copied().unwrap_or(0.0)
+        sums
     }
+}
+
+/// Side of a block in pixels.
+const BLOCK: usize = 16;
+/// Sum of squares up to which a block is flat.
+const FLAT: f64 = 1e-9;
+
+/// Sums over a block of pixels.
+#[derive(Default)]
+struct BlockSums {
+    squares: f64,
+    /// Of each value with that beside it, and with that below it.
+    products: f64,
 }
 
 /// All shifts that are tried.

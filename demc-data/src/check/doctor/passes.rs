@@ -13,6 +13,9 @@ const SUM_TOLERANCE: f64 = 0.02;
 /// Smallest and largest mean variance, in units of that of the half buffers (renders: 0.9 to 1.1).
 const VARIANCE: [f64; 2] = [0.5, 2.0];
 
+/// Largest factor by which the variances of the parts may miss the bounds of that of the colour.
+const PARTS_TOLERANCE: f64 = 1.2;
+
 /// The findings of a scene's passes; none for a file without passes.
 pub(super) fn findings(name: &str, path: &Path, layout: &ChannelLayout) -> Vec<Finding> {
     let problem = |error: &Error| {
@@ -48,8 +51,7 @@ struct PassPlanes(Vec<(String, Vec<f32>)>);
 fn read(path: &Path, layout: &ChannelLayout) -> Result<Option<Contents>, Error> {
     let mut file = ExrFile::open(path)?.on_threads(1);
     let mut layout = layout.in_file(&file, None)?.into_owned();
-    let color = layout.color[0].clone();
-    layout.passes.forget_absent(&file, &color);
+    layout.passes.forget_absent(&file);
     if layout.passes.is_empty() {
         return Ok(None);
     }
@@ -112,6 +114,7 @@ impl PassPlanes {
                 add(format!("{content} is negative"), cause, String::new());
             }
         }
+        let mut color_fits = true;
         for buffer in ["color", "normal", "texture1", "depth"] {
             let half = |number| self.get(&format!("half buffer {number} of {buffer}"));
             let (Some(whole), Some(a), Some(b)) = (self.get(buffer), half(1), half(2)) else {
@@ -146,11 +149,17 @@ impl PassPlanes {
                         .zip(b)
                         .map(|(a, b)| f64::from((a - b) / 2.0).powi(2)),
                 );
-            if ratio < VARIANCE[0] || ratio > VARIANCE[1] {
+            if !(VARIANCE[0]..=VARIANCE[1]).contains(&ratio) {
+                color_fits &= buffer != "color";
                 let cause = "it must be that of the mean: of the samples, divided by their number";
                 let detail = format!("{ratio:.2} times that of its half buffers");
                 add(format!("variance of {buffer} does not fit"), cause, detail);
             }
+        }
+        if let Some(detail) = self.misfit_of_parts().filter(|_| color_fits) {
+            let cause = "each must be that of the mean: of the samples, divided by their number";
+            let problem = "variances of diffuse and specular do not fit that of color";
+            add(problem.to_owned(), cause, detail);
         }
         for (whole, parts, cause) in [
             (
@@ -174,6 +183,22 @@ impl PassPlanes {
             }
         }
         findings
+    }
+
+    /// By how much the variance of the colour is outside the bounds that those of its parts set: the squares of
+    /// the sum and of the difference of their standard deviations (Cauchy and Schwarz).
+    fn misfit_of_parts(&self) -> Option<String> {
+        let get = |content: &str| self.get(&format!("variance of {content}"));
+        let (whole, a, b) = (get("color")?, get("diffuse")?, get("specular")?);
+        let deviations = || {
+            let pairs = a.iter().zip(b);
+            pairs.map(|(a, b)| [a, b].map(|x| f64::from(x.max(0.0)).sqrt()))
+        };
+        let found = mean(whole.iter().map(|x| f64::from(*x)));
+        let most = mean(deviations().map(|[a, b]| (a + b).powi(2)));
+        let least = mean(deviations().map(|[a, b]| (a - b).powi(2)));
+        let fits = found <= PARTS_TOLERANCE * most && found * PARTS_TOLERANCE >= least;
+        (!fits).then(|| format!("{found:.1e} instead of {least:.1e} to {most:.1e}"))
     }
 
     /// Buffers that the other checks examine.

@@ -12,7 +12,7 @@ use crate::check::noise::{self, CORRELATED};
 use crate::dataset::{Scene, size_mismatch};
 use crate::error::Error;
 use crate::image::frame::{Frame, POSITIONS, TEXTURES, read_pair};
-use crate::image::layout::ChannelLayout;
+use crate::image::layout::{ChannelLayout, Missing};
 
 /// Share of pixels with a unit vector that identifies normals (the renders' positions: at most
 /// 0.35).
@@ -129,9 +129,10 @@ fn features(name: &str, frame: &Frame, layout: &ChannelLayout) -> Vec<Finding> {
     let mut findings = Vec::new();
     let buffers = frame.features.chunks_exact(3 * pixels);
     for (buffer, planes) in layout.features().into_iter().zip(buffers) {
-        // A policy replaces a buffer without names.
+        // A policy replaces a buffer without names, and one of zeros a buffer that the file lacks.
         if buffer.channels.is_some()
             && let Some(color) = constant(planes, pixels)
+            && (buffer.missing != Missing::Zeros || color.iter().any(|value| *value != 0.0))
         {
             findings.push(Finding::new(
                 &format!("{} is constant", buffer.name),

@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
+use demc_program::file::FileId;
 
 use crate::image::exr::ExrFile;
 use crate::image::frame::{Presence, check_open_header};
@@ -42,7 +43,7 @@ pub(super) fn exr_files(root: &Path) -> Result<(Vec<PathBuf>, usize)> {
             let kind = entry.file_type().ok();
             if kind.is_some_and(|kind| kind.is_dir()) && !hidden {
                 directories.push(relative);
-            } else if is_exr && !hidden && !entry.path().is_dir() {
+            } else if is_exr && !hidden && entry.path().is_file() {
                 files.push(relative);
             } else if relative != Path::new("manifest.json") {
                 ignored += 1;
@@ -83,8 +84,26 @@ pub(super) fn headers(root: &Path, files: &[PathBuf], layout: Option<&str>) -> R
             groups.collect::<Vec<_>>().join(", ")
         ));
     }
+    problems.extend(same_files(root, &found));
     refuse(root, problems)?;
     Ok(found)
+}
+
+/// Files that stand in the directory under several names.
+fn same_files(root: &Path, found: &[Found]) -> Vec<String> {
+    let mut first: BTreeMap<FileId, &str> = BTreeMap::new();
+    let mut problems = Vec::new();
+    for Found { file, .. } in found {
+        // A file that is gone is reported when it is read.
+        let Ok(id) = FileId::of_existing(&root.join(file)) else {
+            continue;
+        };
+        let other = *first.entry(id).or_insert(file);
+        if other != file {
+            problems.push(format!("{other} and {file} are the same file; remove one"));
+        }
+    }
+    problems
 }
 
 fn header(root: &Path, relative: &Path, chosen: Option<&(&str, ChannelLayout)>) -> Result<Found> {

@@ -16,7 +16,7 @@ use serde_json::{Map, Value, json};
 
 use crate::dataset::{FORMAT, MAX_MANIFEST, Split};
 use found::{exr_files, headers};
-use rules::{Entry, Rules};
+use rules::{Entry, Kept, Rules};
 
 #[derive(Args)]
 #[command(
@@ -36,7 +36,8 @@ pub struct Arguments {
     /// Channel layout: a preset or a TOML file; by default the preset that fits each file
     #[arg(long, value_name = "PRESET|FILE")]
     layout: Option<String>,
-    /// Replace an existing manifest; keys of its scenes that this command does not set stay
+    /// Replace an existing manifest. Keys of its scenes that this command does not set stay, the splits without
+    /// --test, and the base scenes without --base
     #[arg(long)]
     overwrite: bool,
 }
@@ -66,7 +67,7 @@ impl Arguments {
             bail!("{}: no EXR files in it or below", self.root.display());
         }
         let found = headers(&self.root, &files, self.layout.as_deref())?;
-        let scenes = rules.scenes(&self.root, &found)?;
+        let scenes = rules.scenes(&self.root, &found, |file| before.kept(file))?;
         let count = |split: Split| scenes.iter().filter(|scene| scene.split == split).count();
         let bases: BTreeSet<&str> = scenes.iter().map(|scene| scene.base.as_str()).collect();
         let mut summary = format!(
@@ -136,6 +137,19 @@ impl Before {
             }
         }
         Ok(before)
+    }
+
+    /// What a file is in it.
+    fn kept(&self, file: &str) -> Kept {
+        let Some(scene) = self.scenes.get(file) else {
+            return Kept::default();
+        };
+        let split = scene.get("split").cloned();
+        let base = scene.get("base").and_then(Value::as_str);
+        Kept {
+            split: split.and_then(|split| serde_json::from_value(split).ok()),
+            base: base.map(str::to_owned),
+        }
     }
 
     /// The new entry of a scene, with the other keys of its old one.

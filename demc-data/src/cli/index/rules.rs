@@ -28,6 +28,13 @@ pub(super) struct Entry {
     pub(super) height: usize,
 }
 
+/// What a file is in the manifest that is replaced.
+#[derive(Default)]
+pub(super) struct Kept {
+    pub(super) split: Option<Split>,
+    pub(super) base: Option<String>,
+}
+
 impl Rules {
     /// The rules of `--test` and `--base`.
     pub(super) fn new(test: &[String], base: Option<&str>) -> Result<Self, UsageError> {
@@ -54,8 +61,14 @@ impl Rules {
         })
     }
 
-    /// The scenes of these files.
-    pub(super) fn scenes(&self, root: &Path, found: &[Found]) -> Result<Vec<Entry>> {
+    /// The scenes of these files. Without `--test`, a file keeps the split that it has `before`; without
+    /// `--base`, its base scene.
+    pub(super) fn scenes(
+        &self,
+        root: &Path,
+        found: &[Found],
+        before: impl Fn(&str) -> Kept,
+    ) -> Result<Vec<Entry>> {
         let mut problems = Vec::new();
         for (text, pattern) in &self.test {
             if !found.iter().any(|found| matches(pattern, &found.file)) {
@@ -87,22 +100,27 @@ impl Rules {
             if let Some(other) = names.insert(name.clone(), file) {
                 problems.push(format!("{other} and {file} both get the name {name}"));
             }
+            let kept = before(file);
             let base = match &self.base {
-                None => Some(base(path)),
+                None => Some(kept.base.unwrap_or_else(|| base(path).to_owned())),
                 Some(regex) => regex
                     .captures(path)
                     .and_then(|groups| groups.get(1))
-                    .map(|group| group.as_str()),
+                    .map(|group| group.as_str().to_owned()),
             }
             .filter(|base| !base.is_empty());
             if base.is_none() {
                 problems.push(format!("{file}: --base finds no base scene in {path}"));
             }
-            let test = self.test.iter().any(|(_, test)| matches(test, file));
+            let split = match kept.split {
+                Some(split) if self.test.is_empty() => split,
+                _ if self.test.iter().any(|(_, test)| matches(test, file)) => Split::Test,
+                _ => Split::Train,
+            };
             scenes.push(Entry {
                 name,
-                split: if test { Split::Test } else { Split::Train },
-                base: base.unwrap_or_default().to_owned(),
+                split,
+                base: base.unwrap_or_default(),
                 file: file.clone(),
                 width: *width,
                 height: *height,

@@ -18,6 +18,7 @@ use demc_program::parallel;
 
 use super::compression::Compression;
 use super::failure::{guarded, invalid, io_error};
+use super::key_code;
 use super::read::ExrFile;
 use super::recode::{OutputBlock, compress, sort_attributes, targets};
 use crate::error::Error;
@@ -187,6 +188,8 @@ fn joined_header<R: Read + Seek>(
     let mut known: Vec<(Vec<u8>, AttributeValue)> = Vec::new();
     let mut conflicts = Vec::new();
     for header in inputs.iter().flat_map(headers) {
+        let mut header = header;
+        key_code::keep_whole(&mut header);
         for (name, value) in header.all_named_attributes() {
             if STORAGE.contains(&name) {
                 continue;
@@ -232,11 +235,12 @@ fn joined_header<R: Read + Seek>(
     let kept = Compression::of(first.compression)
         .filter(|_| kinds.all(|kind| first.compression.is_lossless_for(kind)));
     let compression = kept.map_or(Compression::Zip.method(), |_| first.compression);
-    let encoded = header.with_encoding(
+    let mut encoded = header.with_encoding(
         compression,
         BlockDescription::ScanLines,
         LineOrder::Increasing,
     );
+    key_code::keep_whole(&mut encoded);
     Ok((encoded, conflicts))
 }
 

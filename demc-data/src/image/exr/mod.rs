@@ -23,6 +23,7 @@ mod blocks;
 mod compression;
 mod decode;
 mod failure;
+mod key_code;
 mod limits;
 pub mod merge;
 pub(super) mod plan;

@@ -9,6 +9,7 @@ use ::exr::meta::{BlockDescription, Headers};
 
 use super::compression::{Compression, name_of};
 use super::failure::undecodable;
+use super::key_code;
 use super::read::{ExrFile, printable};
 use super::write::SamplePrecision;
 use crate::error::Error;
@@ -149,11 +150,13 @@ impl RewritePlan {
                 continue;
             }
             let colored = origins.iter().any(|origin| origin.plane.is_some());
-            plan.headers.push(if colored {
+            let mut header = if colored {
                 colored_header(header, &origins, options, &mut plan.changes)
             } else {
                 header.clone()
-            });
+            };
+            key_code::keep_whole(&mut header);
+            plan.headers.push(header);
             let channels = colored.then_some(origins);
             plan.parts.push(PlannedPart { input, channels });
         }

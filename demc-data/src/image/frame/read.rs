@@ -55,15 +55,15 @@ pub fn decode_repaired<R: Read + Seek>(
     Ok((frame_of(planes, file.path())?, repaired))
 }
 
-/// Reads a frame with its reference. NaN, infinite, and negative samples are replaced as by
+/// Reads a frame with its reference, and with the mask that the layout names. NaN, infinite, and negative samples are replaced as by
 /// [`decode_repaired`] if `repair` is set, and are otherwise an error.
 ///
 /// # Errors
 /// As [`read_frame`]. A layout with a reference and a file without it do not fit.
 pub(crate) fn read_pair(path: &Path, layout: &ChannelLayout, repair: bool) -> Result<Frame, Error> {
     let mut file = ExrFile::open(path)?.on_threads(1);
-    let (reference, mask) = (Presence::Required, Presence::IfPresent);
-    let planes = FramePlanes::decode_with(&mut file, layout, reference, mask, repair)?;
+    let needed = Presence::Required;
+    let planes = FramePlanes::decode_with(&mut file, layout, needed, needed, repair)?;
     frame_of(planes.0, path)
 }
 

@@ -331,7 +331,7 @@ fn without_absent<R: Read + Seek>(
     ] {
         names.take_if(is_absent);
     }
-    layout.passes.forget_absent(file, &layout.color[0]);
+    layout.passes.forget_absent(file);
     layout.missing = missing;
     layout
 }

@@ -96,22 +96,37 @@ impl Passes {
         parts.into_iter().flatten().flatten().chain(&mut self.depth)
     }
 
-    /// Forgets the passes that a file lacks. `color` is the first channel of its colour.
-    pub(crate) fn forget_absent<R: Read + Seek>(&mut self, file: &ExrFile<R>, color: &str) {
+    /// Forgets the passes of which a file has no channel.
+    pub(crate) fn forget_absent<R: Read + Seek>(&mut self, file: &ExrFile<R>) {
         let is_absent = |name: &str| file.channel(name).is_none();
-        for names in [
-            &mut self.diffuse,
-            &mut self.specular,
-            &mut self.reference_diffuse,
-            &mut self.reference_specular,
+        let starts_none = |start: &String| {
+            let mut channels = file.channels().iter();
+            !channels.any(|channel| channel.name.starts_with(start.as_str()))
+        };
+        // Two parts make a whole, so one alone is incomplete.
+        for parts in [
+            [&mut self.diffuse, &mut self.specular],
+            [&mut self.reference_diffuse, &mut self.reference_specular],
         ] {
-            names.take_if(|names| is_absent(&names[0]));
+            let names = || parts.iter().filter_map(|part| part.as_ref()).flatten();
+            if names().all(|name| is_absent(name)) {
+                parts.into_iter().for_each(|part| *part = None);
+            }
         }
-        self.depth.take_if(|name| is_absent(name));
+        let starts = self.half_buffers.iter().flatten().chain(&self.variance);
+        let is_derived = |name: &String| {
+            let mut starts = starts.clone();
+            starts.any(|start| !is_absent(&format!("{start}{name}")))
+        };
+        if let Some(depth) = &self.depth
+            && is_absent(depth)
+            && !is_derived(depth)
+        {
+            self.depth = None;
+        }
         self.half_buffers
-            .take_if(|[start, _]| is_absent(&format!("{start}{color}")));
-        self.variance
-            .take_if(|start| is_absent(&format!("{start}{color}")));
+            .take_if(|starts| starts.iter().all(starts_none));
+        self.variance.take_if(|start| starts_none(start));
     }
 }
 

@@ -97,6 +97,12 @@ pub fn with_attributes(mut header: Header) -> Header {
         bytes: vec![1, 0, 255, 3].into(),
     };
     own.other.insert("renderer/passes".into(), bytes);
+    // As OpenEXR's library writes it: the `exr` crate leaves one of the seven numbers out.
+    let key_code = AttributeValue::Custom {
+        kind: "keycode".into(),
+        bytes: (1..=7).flat_map(i32::to_le_bytes).collect(),
+    };
+    own.other.insert("keyCode".into(), key_code);
     for index in 0..8 {
         let number = AttributeValue::I32(index);
         own.other

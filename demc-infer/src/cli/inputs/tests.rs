@@ -53,6 +53,23 @@ fn a_pattern_finds_files_and_a_file_may_have_such_a_name() {
     assert_eq!(names(&odd, "shot#1.exr", None), ["shot#1.exr"]);
 }
 
+/// As in a shell: a wildcard matches no first dot. A name that is not UTF-8 is left out.
+#[test]
+fn a_pattern_leaves_out_hidden_files_and_names_that_are_not_utf8() {
+    let dir = directory_of(&["a.exr", ".a.exr", ".b/a.exr", "c/a.exr", "c/.d/a.exr"]);
+    #[cfg(unix)]
+    {
+        use std::os::unix::ffi::OsStrExt;
+        let odd = std::ffi::OsStr::from_bytes(b"\xff.exr");
+        fs::write(dir.path().join(odd), "").expect("a file");
+    }
+    let count = |pattern: &str| names(&dir, pattern, None).len();
+    assert_eq!(names(&dir, "*.exr", None), ["a.exr"]);
+    assert_eq!(names(&dir, ".*.exr", None), [".a.exr"]);
+    assert_eq!([count("*/*.exr"), count(".b*/*.exr")], [1, 1]);
+    assert_eq!([count("**/*.exr"), count("c/.d/*.exr")], [2, 1]);
+}
+
 #[test]
 fn arguments_without_images_are_named_and_others_go_on() {
     let dir = directory_of(&["a.txt", ".hidden.exr", "sub/b.exr"]);

@@ -2,6 +2,7 @@ use demc_data::ChannelLayout;
 use demc_data::image::rewrite::{WriteOptions, rewrite};
 
 use super::*;
+use demc_program::checksum::sha256_of;
 
 fn jobs(files: Vec<PathBuf>, output: &Path, previews: bool) -> Result<Jobs, UsageError> {
     let several = files.len() > 1;
@@ -88,11 +89,17 @@ fn an_input_is_never_replaced() -> std::io::Result<()> {
     Ok(())
 }
 
+/// The record of an image with these options.
+fn image_record(options: &Record, input: &Path) -> Record {
+    options.of_image("a.exr", &sha256_of(input).expect("an input"))
+}
+
 /// What is left to write of one input `a.exr` in `dir`, and what was kept.
 fn left(dir: &Path, record: &Record, exposure: f32) -> (bool, bool, Vec<String>) {
     let inputs = vec![dir.join("in/a.exr")];
     let mut jobs = jobs(inputs, &dir.join("out/"), true).expect("a job");
-    jobs.skip_existing(record, exposure, &mut Outputs::default());
+    let of_image = |input: &Path| Some(image_record(record, input));
+    jobs.skip_existing(of_image, exposure, &mut Outputs::default());
     let job = jobs.list.first();
     let due = job.is_some_and(|job| job.is_due);
     let preview = job.is_some_and(|job| job.preview.is_some());
@@ -112,7 +119,7 @@ fn existing_files_are_finished_outdated_or_of_another_kind() {
     let nothing = Vec::new();
     assert_eq!(found(&record), (true, true, nothing.clone()), "missing");
 
-    write_image(&at("out/a.exr"), &record);
+    write_image(&at("out/a.exr"), &image_record(&record, &at("in/a.exr")));
     assert_eq!(found(&record), (false, true, nothing.clone()), "no preview");
     write_preview(&at("out/a.png"), &at("out/a.exr"), 0.0);
     assert_eq!(found(&record), (false, false, nothing.clone()), "finished");
@@ -120,20 +127,29 @@ fn existing_files_are_finished_outdated_or_of_another_kind() {
         left(dir.path(), &record, 1.5),
         (false, true, nothing.clone())
     );
-    set_time(&at("out/a.exr"), 60);
-    assert_eq!(
-        found(&record),
-        (false, true, nothing.clone()),
-        "old preview"
-    );
+    let preview = fs::read(at("out/a.png")).expect("a preview");
+    for length in [preview.len() / 2, preview.len() - 1] {
+        fs::write(at("out/a.png"), &preview[..length]).expect("a file");
+        assert_eq!(found(&record), (false, true, nothing.clone()), "half of it");
+    }
+    fs::write(at("out/a.png"), &preview).expect("a file");
     set_time(&at("in/a.exr"), 120);
-    assert_eq!(found(&record), (true, true, nothing), "newer input");
+    assert_eq!(found(&record), (false, false, nothing.clone()), "touched");
+    fs::write(at("in/a.exr"), "rendered again").expect("a file");
+    set_time(&at("in/a.exr"), 120);
+    assert_eq!(found(&record), (true, true, nothing), "rendered again");
 
-    // Without --overwrite, what another command or program made stays.
+    // Without --overwrite, what another command or program made stays, although the input is newer.
     let fast = Record::of_model("fast", "2b");
+    let expected =
+        vec!["made with other content of input a.exr, --model quality instead of fast".to_owned()];
+    assert_eq!(found(&fast), (false, false, expected));
     set_time(&at("out/a.exr"), 180);
-    let kept = vec!["made with --model quality instead of fast".to_owned()];
-    assert_eq!(found(&fast), (false, false, kept));
+    let kept = vec!["made with other content of input a.exr".to_owned()];
+    assert_eq!(found(&record), (false, false, kept), "an older input");
+    write_image(&at("out/a.exr"), &image_record(&record, &at("in/a.exr")));
+    let expected = (false, true, Vec::new());
+    assert_eq!(found(&record), expected, "the preview of another image");
     let whole = fs::read(at("out/a.exr")).expect("an image");
     for length in [100, whole.len() - 1] {
         fs::write(at("out/a.exr"), &whole[..length]).expect("a file");
@@ -151,13 +167,16 @@ fn existing_files_are_finished_outdated_or_of_another_kind() {
 #[test]
 fn an_output_is_an_exr_file() {
     for output in ["o.png", "o.tif", "-", "o", "/dev/stdout"] {
-        let error = outputs(&["a.exr"], output).expect_err("no EXR file");
+        let sample = "../data/sample/test/gen-table-test-1.exr";
+        let error = outputs(&[sample], output).expect_err("no EXR file");
         assert!(
             error.starts_with(&format!("-o {output}: an output")),
             "{error}"
         );
     }
     assert!(outputs(&["a.exr"], "o.EXR").is_ok());
+    let error = outputs(&["a.%.exr"], "o").expect_err("no input");
+    assert_eq!(error, "a.%.exr: no such file");
 }
 
 #[test]

@@ -213,13 +213,21 @@ fn sync(dir: &Path) -> anyhow::Result<()> {
     sync_dir(dir).with_context(|| dir.display().to_string())
 }
 
-/// Fails with the first file that does not match its checksum.
+/// Fails with the first file that does not match its checksum, or has none.
 fn verify(dir: &Path) -> anyhow::Result<()> {
-    for (sum, name) in sums(dir)? {
+    let sums = sums(dir)?;
+    for (sum, name) in &sums {
         let file = dir.join(name);
-        if sha256_of(&file)? != sum {
+        if sha256_of(&file)? != *sum {
             bail!("{}: damaged, its checksum differs", file.display());
         }
+    }
+    let is_listed = |file: &String| sums.iter().any(|(_, name)| name == file);
+    let unlisted = names_in(dir)?
+        .into_iter()
+        .find(|file| file != SUMS && !is_listed(file));
+    if let Some(file) = unlisted {
+        bail!("{}: no checksum in {SUMS}", dir.join(file).display());
     }
     Ok(())
 }
@@ -296,6 +304,10 @@ mod tests {
             panic!("{found:?}")
         };
         assert!(damage.contains("step-00000006/a file: damaged"), "{damage}");
+        fs::write(dir_of(5).join("another file"), "7").unwrap();
+        let found = store.newest_intact().unwrap();
+        assert!(found.intact.is_none());
+        assert!(found.damaged[1].contains("no checksum"), "{found:?}");
         fs::remove_file(dir_of(5).join("a file")).unwrap();
         let found = store.newest_intact().unwrap();
         assert!(found.intact.is_none() && found.damaged.len() == 2);

@@ -19,6 +19,9 @@ use serde::Deserialize;
 
 use crate::config::{Config, ConfigError, one_line};
 
+/// The key that `seeds` sets.
+const SEED: &str = "train.seed";
+
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct AblationFile {
@@ -95,7 +98,17 @@ impl AblationSpec {
             let message = one_line(&error.to_string());
             ConfigError::Source(format!("{}: {message}", path.display()))
         })?;
-        let problems = file.problems();
+        let mut problems = file.problems();
+        let entries = file.variants.iter();
+        let all_sets = [&file.set[..], sets]
+            .into_iter()
+            .chain(entries.map(|entry| &entry.set[..]));
+        if all_sets
+            .flatten()
+            .any(|set| set.trim_start().starts_with(SEED))
+        {
+            problems.push(format!("{SEED} cannot be set: `seeds` lists the seeds"));
+        }
         if !problems.is_empty() {
             return Err(ConfigError::Values {
                 path: path.into(),
@@ -116,12 +129,22 @@ impl AblationSpec {
         if file.match_parameters {
             match_parameters(&mut variants);
         }
-        Ok(AblationSpec {
+        let spec = AblationSpec {
             files,
             dir: file.dir,
             seeds: file.seeds,
             variants,
-        })
+        };
+        let first = &spec.variants[0];
+        let runs = spec.seeds.iter().map(|seed| spec.run(first, *seed));
+        let problems: Vec<String> = runs.flat_map(|run| run.validate()).collect();
+        if !problems.is_empty() {
+            return Err(ConfigError::Values {
+                path: path.into(),
+                problems,
+            });
+        }
+        Ok(spec)
     }
 
     /// The configuration of one run.
@@ -279,6 +302,11 @@ mod tests {
             error.contains("seeds: expected at least one") && error.contains("at least two"),
             "{error}"
         );
+        let error = load(&format!("seeds = [1, 18446744073709551615]\n{TWO}")).unwrap_err();
+        assert!(error.contains("train.seed"), "{error}");
+        let text = TWO.replace("semc\"]", "semc\", \"train.seed=5\"]");
+        let error = load(&text).unwrap_err();
+        assert!(error.contains("train.seed cannot be set"), "{error}");
         assert!(
             load("seed = 1\n")
                 .unwrap_err()
