@@ -158,7 +158,10 @@ fn attributes_of_the_first_file_win_and_the_others_fill_gaps() {
     first.own_attributes.software_name = Some("another".into());
     first.own_attributes.layer_name = Some("beauty".into());
     let second = placed(with_attributes(new()), (3, -4), display());
-    let expected = second.clone();
+    let mut expected = second.clone();
+    // It is read as a standard attribute.
+    let key_code = expected.own_attributes.other.remove(&"keyCode".into());
+    assert!(key_code.is_some());
     write_file(&a, vec![first]);
     write_file(&b, vec![second]);
     let output = files.path("out.exr");
@@ -176,6 +179,8 @@ fn attributes_of_the_first_file_win_and_the_others_fill_gaps() {
     assert_eq!(own.layer_name, Some("beauty".into()));
     assert_eq!(own.other, expected.own_attributes.other);
     assert_eq!(own.white_luminance, Some(120.0));
+    let key_code = own.film_key_code.expect("read whole");
+    assert_eq!((key_code.count, key_code.perforations_per_count), (4, 7));
     let shared = &header.shared_attributes;
     assert_eq!(
         shared.chromaticities,

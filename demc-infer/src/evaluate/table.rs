@@ -133,6 +133,14 @@ mod tests {
     use super::super::score::tests::image;
     use super::*;
 
+    /// Rust formats at most 65535 columns.
+    #[test]
+    fn a_very_long_name_is_printed() {
+        let name = "x".repeat(70_000);
+        let rows = vec![vec!["scene".to_owned()], vec![name.clone()]];
+        assert!(aligned(&rows).contains(&name));
+    }
+
     #[test]
     fn the_rows_of_the_table_have_one_width() {
         let report = Report::new(vec![

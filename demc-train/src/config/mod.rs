@@ -242,12 +242,13 @@ impl Config {
         (self.data.batch_size * self.train.grad_accumulation) as u64
     }
 
-    /// The first 16 digits of the SHA-256 of the keys that change numbers of the run; see
-    /// [`differences`](Self::differences).
-    pub fn hash(&self) -> String {
+    /// The first 16 digits of the SHA-256 of the keys that change numbers of the run (see
+    /// [`differences`](Self::differences)) and of the checksums of the scenes by name.
+    pub fn hash(&self, scenes: &BTreeMap<String, String>) -> String {
         let keys = self.relevant();
-        let text = keys.iter().map(|(key, value)| format!("{key} = {value}\n"));
-        let mut digits = sha256([text.collect::<String>().as_bytes()]);
+        let keys = keys.iter().map(|(key, value)| format!("{key} = {value}\n"));
+        let files = scenes.iter().map(|(name, sum)| format!("{sum}  {name}\n"));
+        let mut digits = sha256([keys.chain(files).collect::<String>().as_bytes()]);
         digits.truncate(HASH_DIGITS);
         digits
     }

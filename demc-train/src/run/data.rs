@@ -58,6 +58,14 @@ fn checksums<'a>(
         .collect()
 }
 
+/// The SHA-256 of each scene's file in a data set, by the scene's name.
+///
+/// # Errors
+/// A manifest or a file that cannot be read.
+pub fn file_checksums(root: &Path) -> Result<BTreeMap<String, String>, demc_data::Error> {
+    checksums(Dataset::list(root)?.iter())
+}
+
 /// A warning for each group of scenes with equal files.
 fn copies(checksums: &BTreeMap<String, String>) -> Vec<String> {
     let mut scenes: BTreeMap<&str, Vec<&str>> = BTreeMap::new();

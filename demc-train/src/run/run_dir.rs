@@ -11,6 +11,7 @@
 //! test.json         scores of the test split
 //! ```
 
+use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -120,6 +121,18 @@ impl RunDir {
         let path = self.path.join(RUN);
         match read_record(&path)? {
             StoredRecord::Intact(record) => record.check_scenes(&path, data),
+            StoredRecord::Missing | StoredRecord::Damaged => Ok(()),
+        }
+    }
+
+    /// Compares the files of scenes with those of the start of the run, if its record is intact.
+    ///
+    /// # Errors
+    /// Each scene that differs, by name.
+    pub fn check_files(&self, checksums: &BTreeMap<String, String>) -> anyhow::Result<()> {
+        let path = self.path.join(RUN);
+        match read_record(&path)? {
+            StoredRecord::Intact(record) => record.check_files(&path, checksums),
             StoredRecord::Missing | StoredRecord::Damaged => Ok(()),
         }
     }

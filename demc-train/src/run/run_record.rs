@@ -149,17 +149,26 @@ impl RunRecord {
             path.display(),
             short_list(&moved)
         );
-        let changed: Vec<&str> = data
-            .checksums
-            .iter()
-            .filter(|(name, sum)| {
-                let before = self.checksums.get(*name);
-                before.is_some_and(|before| before != *sum)
-            })
-            .map(|(name, _)| name.as_str())
+        self.check_files(path, &data.checksums)
+    }
+
+    /// Compares the files of scenes, by their checksums, with those of the start.
+    ///
+    /// # Errors
+    /// Each scene whose file changed, or that is new or gone.
+    pub fn check_files(
+        &self,
+        path: &Path,
+        checksums: &BTreeMap<String, String>,
+    ) -> anyhow::Result<()> {
+        let names: BTreeSet<&String> = checksums.keys().chain(self.checksums.keys()).collect();
+        let changed: Vec<&str> = names
+            .into_iter()
+            .filter(|name| checksums.get(*name) != self.checksums.get(*name))
+            .map(String::as_str)
             .collect();
         ensure!(
-            changed.is_empty(),
+            changed.is_empty() || self.checksums.is_empty(),
             "{}: files of scenes changed since the run started: {}; restore them, or start a new run",
             path.display(),
             short_list(&changed)

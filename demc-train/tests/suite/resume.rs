@@ -4,7 +4,8 @@ use std::fs;
 use std::path::Path;
 
 use crate::common::{
-    assert_same_run, config, error_line, kill_after, metrics, place, says, stderr, train, trained,
+    assert_same_run, config, copy_sample, error_line, kill_after, metrics, place, says, stderr,
+    train, trained,
 };
 
 #[test]
@@ -78,6 +79,34 @@ fn a_file_that_belongs_to_no_run_is_kept() {
         fs::remove_file(&path).expect("removed");
     }
     trained(&config, &run, &["--set=train.steps=1"]);
+}
+
+#[test]
+fn other_patches_per_epoch_are_refused() {
+    let (dir, config, run) = place();
+    let data = dir.path().join("data");
+    copy_sample(&data);
+    let set = format!("--set=data.root={}", data.display());
+    let args = [
+        set.as_str(),
+        "--set=train.steps=2",
+        "--set=run.checkpoint_every=1",
+    ];
+    trained(&config, &run, &args);
+    let manifest = data.join("manifest.json");
+    let text = fs::read_to_string(&manifest).expect("a manifest");
+    let repeated = text.replacen(
+        "\"split\": \"train\"",
+        "\"split\": \"train\", \"repeat\": 3",
+        1,
+    );
+    assert_ne!(repeated, text);
+    fs::write(&manifest, repeated).expect("written");
+    let error = error_line(
+        &train(&config, &run, &[&args[..], &["--resume"]].concat()),
+        1,
+    );
+    assert!(error.contains("patches per epoch instead of"), "{error}");
 }
 
 #[test]

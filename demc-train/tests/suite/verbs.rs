@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::common::{config, error_line, metrics, says, stderr, trained};
+use crate::common::{config, copy_sample, error_line, metrics, says, stderr, trained};
 
 fn run(args: &[&str]) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_demc-train"));
@@ -153,6 +153,21 @@ fn an_ablation_resumes_from_its_results_and_remakes_its_tables() {
     assert!(!said.contains("DEMC, seed 1 (1 of 6): complete"), "{said}");
     assert!(out.join("DEMC-seed-1").exists(), "trained again");
     assert_eq!(rows(&out, "DEMC-seed-1"), 8);
+
+    // Nor do runs on other data.
+    let data = dir.path().join("data");
+    copy_sample(&data);
+    let moved = format!("data.root={}", text(&data));
+    let said = stdout(&run(&[&args[..], &["--set", &moved]].concat()));
+    says(&said, "DEMC, seed 1 (1 of 6): complete in");
+    let scenes =
+        ["gen-table-test-1.exr", "gen-room-test-1.exr"].map(|name| data.join("test").join(name));
+    fs::copy(&scenes[0], &scenes[1]).expect("another image");
+    let error = error_line(&run(&[&args[..], &["--set", &moved]].concat()), 1);
+    says(
+        &error,
+        "files of scenes changed since the run started: gen-room-test-1",
+    );
 
     // The results alone make all tables.
     let alone = dir.path().join("alone");

@@ -102,6 +102,17 @@ fn arguments_without_images_are_named_and_others_go_on() {
 }
 
 #[test]
+fn images_that_are_not_chosen_are_protected() {
+    let dir = directory_of(&["s.1.exr", "s.2.exr", "s.3.exr"]);
+    let frames = "1-2".parse().ok();
+    let found = Inputs::expand(&[dir.path().join("s.#.exr")], frames.as_ref()).expect("frames");
+    let mut outputs = Outputs::default();
+    found.protect(&mut outputs);
+    assert!(outputs.claim(&dir.path().join("s.3.exr"), true).is_err());
+    assert!(outputs.claim(&dir.path().join("s.4.exr"), true).is_ok());
+}
+
+#[test]
 fn a_number_padded_with_spaces_is_refused() {
     let error = Inputs::expand(&["shot.%4d.exr".into()], None).expect_err("spaces");
     let why = "shot.%4d.exr: %4d pads numbers with spaces; write %04d";

@@ -11,6 +11,7 @@ pub mod results;
 pub mod spec;
 mod table;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -26,10 +27,10 @@ use crate::config::{Config, HASH_DIGITS};
 use crate::record::metrics_log;
 use crate::record::progress::say;
 use crate::run::checkpoint::store::CheckpointStore;
-use crate::run::data::protect_inputs;
+use crate::run::data::{file_checksums, protect_inputs};
 use crate::run::initial::read_init;
 use crate::run::place::SessionPlace;
-use crate::run::run_dir::SCORES;
+use crate::run::run_dir::{RunDir, SCORES};
 use crate::run::session::{Session, SessionOptions};
 use crate::run::signals::{Outcome, Stopped};
 use comparison::Comparison;
@@ -68,10 +69,12 @@ pub fn run(
 ) -> anyhow::Result<Outcome<Option<Box<Comparison>>>> {
     let reduce = &place.reduce;
     let planned = planned(spec);
+    let mut files = DataFiles::new();
     let missing = reduce.from_first(|| {
         check_init(spec)?;
         check_outputs(spec)?;
-        let progress = collect(spec, &planned)?;
+        files = data_files(spec)?;
+        let progress = collect(spec, &planned, &files)?;
         progress.notes.iter().for_each(say);
         Ok(progress.missing)
     })?;
@@ -87,11 +90,11 @@ pub fn run(
         };
         let stopped = train(spec, run, &place).with_context(|| run.name.clone())?;
         if reduce.is_first() {
-            collect(spec, &planned)?;
+            collect(spec, &planned, &files)?;
         }
         Ok(stopped)
     })?;
-    let progress = reduce.is_first().then(|| collect(spec, &planned));
+    let progress = reduce.is_first().then(|| collect(spec, &planned, &files));
     let progress = reduce.agree(progress.transpose())?;
     if let Some(stopped) = stopped {
         return Ok(Outcome::Stopped(stopped));
@@ -127,10 +130,28 @@ fn planned(spec: &AblationSpec) -> Vec<PlannedRun> {
     runs.collect()
 }
 
-/// Looks for complete runs: in their directories, then in `results.csv`, whose rows count if the
-/// configuration is the same. Writes the rows of all complete runs. Rows of other runs stay at the
+/// The checksums of the scenes of each data set, by its directory.
+type DataFiles = BTreeMap<PathBuf, BTreeMap<String, String>>;
+
+fn data_files(spec: &AblationSpec) -> anyhow::Result<DataFiles> {
+    let mut files = DataFiles::new();
+    for variant in &spec.variants {
+        let root = &variant.config.data.root;
+        if !files.contains_key(root) {
+            files.insert(root.clone(), file_checksums(root)?);
+        }
+    }
+    Ok(files)
+}
+
+/// Looks for complete runs: in their directories, then in `results.csv`, whose rows count if
+/// configuration and data are the same. Writes the rows of all complete runs. Rows of other runs stay at the
 /// end of the file.
-fn collect(spec: &AblationSpec, planned: &[PlannedRun]) -> anyhow::Result<Progress> {
+fn collect(
+    spec: &AblationSpec,
+    planned: &[PlannedRun],
+    files: &DataFiles,
+) -> anyhow::Result<Progress> {
     let path = spec.dir.join(RESULTS);
     let stored = results::read(&path)?;
     let mut others = stored.clone();
@@ -139,10 +160,11 @@ fn collect(spec: &AblationSpec, planned: &[PlannedRun]) -> anyhow::Result<Progre
     for run in planned {
         let is_stored =
             |row: &ScoredRun| row.variant == run.variant && row.seed == run.config.train.seed;
-        let hash = run.config.hash();
+        let scenes = &files[&run.config.data.root];
+        let hash = run.config.hash(scenes);
         let is_same = |row: &&ScoredRun| is_stored(row) && row.configuration == hash;
         let in_file = || Some((stored.iter().find(is_same)?.clone(), path.as_path()));
-        let in_dir = finished(run)?.map(|found| (found, run.config.run_dir()));
+        let in_dir = finished(run, scenes)?.map(|found| (found, run.config.run_dir()));
         let found = in_dir.or_else(in_file);
         if let Some((_, place)) = &found {
             notes.push(format!("== {}: complete in {}", run.name, place.display()));
@@ -227,8 +249,11 @@ fn check_outputs(spec: &AblationSpec) -> anyhow::Result<()> {
     Ok(outputs.prepare(Directories::Create)?)
 }
 
-/// The scores of a run whose directory is complete.
-fn finished(run: &PlannedRun) -> anyhow::Result<Option<ScoredRun>> {
+/// The scores of a run whose directory is complete, on data with these checksums.
+fn finished(
+    run: &PlannedRun,
+    scenes: &BTreeMap<String, String>,
+) -> anyhow::Result<Option<ScoredRun>> {
     let config = &run.config;
     let dir = config.run_dir();
     let scores = dir.join(SCORES);
@@ -244,6 +269,7 @@ fn finished(run: &PlannedRun) -> anyhow::Result<Option<ScoredRun>> {
         dir.display(),
         differences.join("; ")
     );
+    RunDir::unclaimed(config).check_files(scenes)?;
     let text = fs::read_to_string(&scores).with_context(|| scores.display().to_string())?;
     let report: Report =
         serde_json::from_str(&text).with_context(|| scores.display().to_string())?;
@@ -253,7 +279,7 @@ fn finished(run: &PlannedRun) -> anyhow::Result<Option<ScoredRun>> {
     Ok(Some(ScoredRun {
         variant: run.variant.clone(),
         seed: config.train.seed,
-        configuration: config.hash(),
+        configuration: config.hash(scenes),
         weights,
         steps: config.train.steps,
         minutes: seconds / 60.0,

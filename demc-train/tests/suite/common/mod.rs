@@ -9,6 +9,18 @@ pub fn sample() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../data/sample")
 }
 
+/// Copies the sample's data set.
+pub fn copy_sample(to: &Path) {
+    for folder in ["", "train", "test"] {
+        std::fs::create_dir_all(to.join(folder)).expect("a directory");
+        let entries = std::fs::read_dir(sample().join(folder)).expect("the sample");
+        for file in entries.flatten().filter(|entry| entry.path().is_file()) {
+            let copy = to.join(folder).join(file.file_name());
+            std::fs::copy(file.path(), copy).expect("copied");
+        }
+    }
+}
+
 /// A run of twelve steps with everything that a resume could lose: batch normalisation, all
 /// augmentations, a weight average, Muon, two batches per step. Logs and checkpoints are at
 /// different steps.
