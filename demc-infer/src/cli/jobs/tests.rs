@@ -24,7 +24,11 @@ fn outputs(inputs: &[&str], output: &str) -> Result<Vec<PathBuf>, String> {
 
 /// The error of claiming the files of a job list.
 fn refusal(jobs: &Jobs) -> String {
-    let claimed = jobs.claim(&mut Outputs::default());
+    let mut outputs = Outputs::default();
+    for job in &jobs.list {
+        outputs.protect(&job.input, "the input");
+    }
+    let claimed = jobs.claim(&mut outputs);
     claimed.expect_err("refused").to_string()
 }
 
