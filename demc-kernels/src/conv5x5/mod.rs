@@ -11,10 +11,8 @@ use rayon::prelude::*;
 
 use crate::rows::{self, BLOCK, Outer, Packed, Term, whole};
 use crate::{Convolution, GradientSource, GradientTarget, Grid, Isa};
-use padded::PaddedMap;
+use padded::{PaddedMap, SIDE};
 
-/// Side of the kernel.
-const SIDE: usize = 5;
 /// Weights of a kernel.
 const TAPS: usize = SIDE * SIDE;
 

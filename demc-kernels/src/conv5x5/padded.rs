@@ -2,12 +2,13 @@
 
 use rayon::prelude::*;
 
-use super::SIDE;
 use crate::product::{ROW_BLOCK, padded_rows};
 use crate::rows::{self, BLOCK, Copy, copy};
 use crate::scratch::Scratch;
 use crate::{Grid, Isa};
 
+/// Side of the kernel.
+pub(super) const SIDE: usize = 5;
 /// Pixels of padding on each side.
 const REACH: usize = SIDE / 2;
 
