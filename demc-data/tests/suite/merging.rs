@@ -160,7 +160,8 @@ fn attributes_of_the_first_file_win_and_the_others_fill_gaps() {
     let second = placed(with_attributes(new()), (3, -4), display());
     let mut expected = second.clone();
     // It is read as a standard attribute.
-    let key_code = expected.own_attributes.other.remove(&"keyCode".into());
+    let name = exr::meta::attribute::Text::from("keyCode");
+    let key_code = expected.own_attributes.other.remove(&name);
     assert!(key_code.is_some());
     write_file(&a, vec![first]);
     write_file(&b, vec![second]);
