@@ -30,6 +30,17 @@ pub enum Error {
         missing: Vec<String>,
         present: Vec<String>,
     },
+    /// The file or the layout lacks passes.
+    #[error(
+        "{}: lacks {}; render with tools/render --passes paper, or name other channels in [passes] of a layout",
+        path.display(),
+        list(missing)
+    )]
+    MissingPasses {
+        path: PathBuf,
+        /// Names of channels; the content of buffers that the layout does not name.
+        missing: Vec<String>,
+    },
     /// Two buffers of one image cover different pixels.
     #[error("{}: buffers of different sizes: {a} is {a_window}, {b} is {b_window}", path.display())]
     Sizes {

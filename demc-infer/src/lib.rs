@@ -60,6 +60,7 @@ mod error;
 pub mod evaluate;
 pub mod guard;
 pub mod memory;
+pub mod nfor;
 pub mod onnx;
 pub mod padding;
 pub mod picture;

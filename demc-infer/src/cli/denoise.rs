@@ -6,9 +6,7 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use demc_data::ChannelLayout;
 use demc_data::image::exr::ExrFile;
-use demc_data::image::frame::{decode_input, decode_repaired};
 use demc_data::image::rewrite::Replaced;
 use demc_program::checksum::sha256_of;
 use demc_program::message;
@@ -16,11 +14,12 @@ use demc_program::output::{Directories, Outputs};
 
 use super::clamped::Clamped;
 use super::exposure::{InputScale, InputScaleFlag, SequenceScales, stops};
+use super::filter::FilterFlag;
 use super::flags::{DeviceFlag, EnsembleFlag, LightFlag, ModelFlag, TilingFlags, describe};
 use super::frames::Frames;
 use super::inputs::{Inputs, place};
 use super::jobs::{Job, Jobs};
-use super::layers::{LayersFlag, read_layers};
+use super::layers::LayersFlag;
 use super::layouts::{LayoutFlags, Layouts};
 use super::output_flags::OutputFlags;
 use super::preview;
@@ -31,7 +30,7 @@ use super::warnings::Warnings;
 use crate::denoise::{DenoiseOptions, DenoiseProgress};
 use crate::guard::{EnergyBias, Warning};
 use crate::{Bundle, Ensemble};
-use work::{Contents, Prepared, Work, cache_bytes, described, far_from_sequence};
+use work::{Contents, Method, Prepared, Work, cache_bytes, described, far_from_sequence};
 
 /// Denoise OpenEXR images of up to 32768 pixels a side and 134217728 pixels.
 ///
@@ -56,10 +55,13 @@ use work::{Contents, Prepared, Work, cache_bytes, described, far_from_sequence};
   demc-infer denoise --model demc.safetensors renders/ -o denoised/
   demc-infer denoise 'shot.####.exr' --frames 1-10,15,20-40x2 -o denoised/
   demc-infer denoise 'shot.####.exr' --shard 3/8 -o denoised/
-  demc-infer denoise shot.exr --layers 'ViewLayer.Combined_*' -o clean.exr")]
+  demc-infer denoise shot.exr --layers 'ViewLayer.Combined_*' -o clean.exr
+  demc-infer denoise --filter nfor passes.exr -o clean.exr")]
 pub struct Arguments {
     #[command(flatten)]
     model: ModelFlag,
+    #[command(flatten)]
+    filter: FilterFlag,
     #[command(flatten)]
     layout: LayoutFlags,
     #[command(flatten)]
@@ -133,10 +135,13 @@ impl Arguments {
         self.layout.protect(&mut outputs);
         jobs.claim(&mut outputs)?;
         let layouts = self.layout.read()?;
-        let bundle = self.model.load_onto(&self.device)?;
-        self.layers.check(&bundle, self.ensemble.passes)?;
-        let record = self.record(&bundle, &layouts)?;
-        let mut scales = SequenceScales::new(&inputs.sequences);
+        let method = self.method()?;
+        let record = self.record(&method, &layouts)?;
+        let mut scales = SequenceScales::new(match method {
+            Method::Network(_) => &inputs.sequences,
+            // A filter has no factor.
+            Method::Filter(_) => &[],
+        });
         if !self.overwrite {
             let of_image = |input: &Path| self.image_record(&record, input, &scales).ok();
             jobs.skip_existing(of_image, self.exposure, &mut outputs);
@@ -145,25 +150,22 @@ impl Arguments {
         outputs.prepare(Directories::Create)?;
         let jobs = jobs.list;
         let work = Work {
-            bundle,
+            method,
             layouts,
             record,
             progress: Progress::new(jobs.len()),
             warnings: Warnings::default(),
         };
-        let Work {
-            bundle,
-            layouts,
-            progress,
-            ..
-        } = &work;
+        let progress = &work.progress;
         let mut clamped = Clamped::default();
         let mut failed = 0;
         for job in &jobs {
             progress.start(job.input.display());
-            let exposure = match self.input_scale.choice.factor() {
-                None => scales.exposure(&job.input, bundle, layouts),
-                Some(_) => None,
+            let exposure = match (&work.method, self.input_scale.choice.factor()) {
+                (Method::Network(bundle), None) => {
+                    scales.exposure(&job.input, bundle, &work.layouts)
+                }
+                _ => None,
             };
             let done = self
                 .image_record(&work.record, &job.input, &scales)
@@ -193,9 +195,18 @@ impl Arguments {
         Ok(())
     }
 
+    fn method(&self) -> anyhow::Result<Method> {
+        if let Some(filter) = self.filter.filter {
+            return Ok(Method::Filter(filter));
+        }
+        let bundle = self.model.load_onto(&self.device)?;
+        self.layers.check(&bundle, self.ensemble.passes)?;
+        Ok(Method::Network(Box::new(bundle)))
+    }
+
     /// The options that change an output.
-    fn record(&self, bundle: &Bundle, layouts: &Layouts) -> anyhow::Result<Record> {
-        let mut record = Record::of_model(&self.model.short_name(), &bundle.checksum()?);
+    fn record(&self, method: &Method, layouts: &Layouts) -> anyhow::Result<Record> {
+        let mut record = method.record(&self.model)?;
         layouts.record(&mut record);
         self.layers.record(&mut record);
         self.output_flags.record(&mut record);
@@ -244,16 +255,11 @@ impl Arguments {
         record: &Record,
         exposure: Option<f64>,
     ) -> anyhow::Result<usize> {
-        let Work {
-            bundle,
-            layouts,
-            progress,
-            ..
-        } = work;
+        let progress = &work.progress;
         let name = job.input.display();
         let file = ExrFile::open(&job.input)?;
         let say = |choice: &str| progress.line(format_args!("note: {name}: {choice}"));
-        let layout = &layouts.of(&file, bundle, say)?;
+        let layout = &work.layout(&file, say)?;
         let clamped = if job.is_due {
             let prepared = Prepared {
                 file,
@@ -261,7 +267,20 @@ impl Arguments {
                 record,
                 exposure,
             };
-            self.denoise(work, job, prepared)?
+            match &work.method {
+                Method::Network(bundle) => self.denoise(work, bundle, job, prepared)?,
+                Method::Filter(filter) => {
+                    let mut file = prepared.file.keeping(&layout.color, cache_bytes());
+                    let planes = filter.denoise(&mut file, layout)?;
+                    let replaced = Replaced {
+                        layout,
+                        layers: &[],
+                        planes: &planes,
+                    };
+                    self.write(work, job, &mut file, &replaced, record)?;
+                    0
+                }
+            }
         } else {
             0
         };
@@ -279,13 +298,14 @@ impl Arguments {
     }
 
     /// Denoises one image. Returns the number of negative samples, which were set to 0.
-    fn denoise(&self, work: &Work, job: &Job, prepared: Prepared) -> anyhow::Result<usize> {
-        let Work {
-            bundle,
-            progress,
-            warnings,
-            ..
-        } = work;
+    fn denoise(
+        &self,
+        work: &Work,
+        bundle: &Bundle,
+        job: &Job,
+        prepared: Prepared,
+    ) -> anyhow::Result<usize> {
+        let (progress, warnings) = (&work.progress, &work.warnings);
         let Prepared {
             file,
             layout,
@@ -299,7 +319,7 @@ impl Arguments {
             frame,
             layers,
             repaired,
-        } = self.contents(&mut file, layout, &names)?;
+        } = Contents::read(&mut file, layout, &names, self.repair)?;
         if repaired > 0 {
             progress.line(format_args!("note: {name}: {repaired} samples repaired"));
         }
@@ -336,12 +356,6 @@ impl Arguments {
             let error = described(&error);
             progress.line(format_args!("note: {name}: {error}"));
         }
-        if !job.replaces && job.output.exists() {
-            let output = job.output.display();
-            anyhow::bail!(
-                "{output} was written by another program meanwhile; --overwrite replaces it"
-            );
-        }
         let image = &denoised.color_hdr;
         EnergyBias::of(&frame, image)
             .warning()
@@ -357,38 +371,30 @@ impl Arguments {
             layers: &names,
             planes: &planes,
         };
-        for note in self
-            .output_flags
-            .write(&mut file, &job.output, &replaced, &record.text())?
-        {
-            progress.line(format_args!("note: {name}: {note}"));
-        }
+        self.write(work, job, &mut file, &replaced, record)?;
         Ok(frame.clamped)
     }
 
-    /// Decodes the frame and these layers, and repairs them if wanted.
-    fn contents(
+    /// Writes an output, unless another program did so meanwhile.
+    fn write(
         &self,
+        work: &Work,
+        job: &Job,
         file: &mut ExrFile,
-        layout: &ChannelLayout,
-        names: &[String],
-    ) -> anyhow::Result<Contents> {
-        let (mut frame, repaired) = if self.repair {
-            decode_repaired(file, layout)?
-        } else {
-            (decode_input(file, layout)?, 0)
-        };
-        frame.name = file.path().display().to_string();
-        let (layers, more) = read_layers(file, layout, names, self.repair)?;
-        let alpha = layout.alpha.as_ref();
-        if alpha.is_some_and(|alpha| names.contains(alpha)) {
-            // As a layer, alpha needs no pass of its own.
-            frame.alpha = None;
+        replaced: &Replaced,
+        record: &Record,
+    ) -> anyhow::Result<()> {
+        if !job.replaces && job.output.exists() {
+            let output = job.output.display();
+            anyhow::bail!(
+                "{output} was written by another program meanwhile; --overwrite replaces it"
+            );
         }
-        Ok(Contents {
-            frame,
-            layers,
-            repaired: repaired + more,
-        })
+        let flags = &self.output_flags;
+        for note in flags.write(file, &job.output, replaced, &record.text())? {
+            let name = job.input.display();
+            work.progress.line(format_args!("note: {name}: {note}"));
+        }
+        Ok(())
     }
 }

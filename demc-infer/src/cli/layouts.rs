@@ -5,7 +5,7 @@ use std::path::Path;
 
 use clap::Args;
 use demc_data::image::exr::ExrFile;
-use demc_data::image::layout::{FeatureBuffer, FileLayout, Missing, detect};
+use demc_data::image::layout::{FeatureBuffer, FileLayout, Missing, MissingPolicies, detect};
 use demc_data::{ChannelLayout, Dataset, Error};
 use demc_program::checksum::sha256;
 use demc_program::exit::UsageError;
@@ -109,14 +109,38 @@ impl Layouts<'_> {
         file: &ExrFile,
         bundle: &Bundle,
     ) -> Result<(ChannelLayout, Option<String>), Error> {
+        self.choose_for(file, &bundle.meta.layout, bundle.missing())
+    }
+
+    /// The layout of a file whose passes a filter needs: without `--layout`, this project's if it fits.
+    ///
+    /// # Errors
+    /// As [`choose`](Self::choose).
+    pub fn of_filtered(&self, file: &ExrFile) -> Result<ChannelLayout, Error> {
+        let missing = MissingPolicies {
+            position: Missing::Zeros,
+            texture2: Missing::CopyTexture1,
+            ..MissingPolicies::default()
+        };
+        let mut own = ChannelLayout::resolve("demc-exr").expect("a preset");
+        own.missing = missing;
+        Ok(self.choose_for(file, &own, missing)?.0)
+    }
+
+    /// As [`choose`](Self::choose), with a layout that is preferred to presets, and policies for what a file
+    /// lacks.
+    fn choose_for(
+        &self,
+        file: &ExrFile,
+        own: &ChannelLayout,
+        missing: MissingPolicies,
+    ) -> Result<(ChannelLayout, Option<String>), Error> {
         let layer = self.flags.layer.as_deref();
-        let missing = bundle.missing();
         if let Some(given) = &self.given {
             let mut layout = given.in_file(file, layer)?.into_owned();
             layout.missing = layout.missing.or(missing);
             return Ok((layout, None));
         }
-        let own = &bundle.meta.layout;
         if let Ok(own) = own.in_file(file, layer)
             && own.fits(file)
         {

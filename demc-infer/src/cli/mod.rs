@@ -11,6 +11,7 @@ mod evaluate;
 mod export;
 mod exposure;
 mod exposure_curve;
+mod filter;
 mod flags;
 mod frames;
 mod import;

@@ -32,6 +32,13 @@ impl Record {
         record
     }
 
+    /// A record of a filter, by its name.
+    pub fn of_filter(name: &str) -> Self {
+        let mut record = Self::default();
+        record.add("--filter", name);
+        record
+    }
+
     /// The same record for an image, by the name and the checksum of its file.
     #[must_use]
     pub fn of_image(&self, name: &str, checksum: &str) -> Self {

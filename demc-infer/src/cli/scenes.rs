@@ -3,15 +3,17 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use demc_data::{ChannelLayout, Dataset, Frame, Rgb, Scene};
+use demc_data::image::exr::ExrFile;
+use demc_data::{ChannelLayout, Dataset, Frame, Scene};
 use demc_program::exit::UsageError;
 use demc_program::message::printable;
 use demc_program::output::Outputs;
 
 use super::clamped::Clamped;
 use super::exposure::InputScaleFlag;
+use super::filter::Filter;
 use super::flags::{DeviceFlag, EnsembleFlag, LightFlag, ModelFlag};
-use super::layouts::LayoutFlags;
+use super::layouts::{LayoutFlags, Layouts};
 use super::outputs;
 use super::progress::Progress;
 use crate::denoise::{DenoiseError, DenoiseOptions, Denoised, unobserved};
@@ -33,9 +35,10 @@ pub struct Scenes {
     #[arg(long, value_enum, default_value = "test")]
     pub split: SplitFlag,
     /// Images of the same scenes from another program. DIR has one EXR file per scene, with
-    /// channels R, G, B and the scene's file name. The flag can be repeated
-    #[arg(long = "baseline", value_name = "NAME=DIR")]
-    baselines: Vec<Baseline>,
+    /// channels R, G, B and the scene's file name. Without DIR, NAME is a filter of `denoise`: nfor,
+    /// which needs the channels of tools/render --passes paper. The flag can be repeated
+    #[arg(long = "baseline", value_name = "NAME=DIR|nfor", value_parser = Compared::parse)]
+    baselines: Vec<Compared>,
     #[command(flatten)]
     input_scale: InputScaleFlag,
     #[command(flatten)]
@@ -88,7 +91,7 @@ impl Scenes {
         self.model.protect(&mut outputs);
         self.layout.protect(&mut outputs);
         let scenes = Dataset::protect(&self.data, &mut outputs)?;
-        for baseline in &self.baselines {
+        for baseline in self.baselines.iter().filter_map(Compared::images) {
             let what = format!("an image of baseline {}", baseline.name);
             for scene in &scenes {
                 outputs.protect(&baseline.path(scene), &what);
@@ -115,7 +118,7 @@ impl Scenes {
         let layout = &layouts.of_dataset(&self.data, &bundle)?;
         let dataset = Dataset::open(&self.data, layout)?;
         let scenes = dataset.split(self.split.into())?;
-        baseline::check(&self.baselines, &scenes).map_err(|error| match error {
+        self.check_baselines(&scenes).map_err(|error| match error {
             BaselineError::Taken(_) => {
                 anyhow::Error::new(UsageError(format!("--baseline {error}")))
             }
@@ -134,7 +137,7 @@ impl Scenes {
             progress.start(&scene.name);
             let denoise = |frame: &Frame| bundle.denoise_with(frame, &options, unobserved);
             let process = |images: &SceneImages| process(images, scenes.len());
-            let files = self.read_scene(scene, layout, &mut clamped);
+            let files = self.read_scene(scene, &layouts, layout, &mut clamped);
             match files.and_then(|files| self.score_scene(scene, &files, denoise, process)) {
                 Ok((score, processed)) => {
                     finish(processed, &score)?;
@@ -158,6 +161,18 @@ impl Scenes {
         })
     }
 
+    /// Checks that names are unique and not reserved, and that every image exists.
+    fn check_baselines(&self, scenes: &[Scene]) -> Result<(), BaselineError> {
+        for (i, baseline) in self.baselines.iter().enumerate() {
+            let name = baseline.name();
+            if self.baselines[..i].iter().any(|other| other.name() == name) {
+                return Err(BaselineError::Taken(name.to_owned()));
+            }
+        }
+        let images = self.baselines.iter().filter_map(Compared::images);
+        baseline::check(&images.cloned().collect::<Vec<_>>(), scenes)
+    }
+
     fn score_scene<T: Send>(
         &self,
         scene: &Scene,
@@ -170,7 +185,7 @@ impl Scenes {
             .baselines
             .iter()
             .zip(baselines)
-            .map(|(baseline, image)| (baseline.name.as_str(), image.planes.as_slice()))
+            .map(|(baseline, image)| (baseline.name(), image.as_slice()))
             .collect();
         let denoised = denoise(frame)?.color_hdr;
         let residual = scene.ref_residual_relmse;
@@ -189,6 +204,7 @@ impl Scenes {
     fn read_scene(
         &self,
         scene: &Scene,
+        layouts: &Layouts,
         layout: &ChannelLayout,
         clamped: &mut Clamped,
     ) -> anyhow::Result<SceneFiles> {
@@ -197,9 +213,18 @@ impl Scenes {
         clamped.count(frame.clamped);
         let mut baselines = Vec::with_capacity(self.baselines.len());
         for baseline in &self.baselines {
-            let image = baseline.read(scene)?;
-            clamped.count(image.clamped);
-            baselines.push(image);
+            baselines.push(match baseline {
+                Compared::Images(baseline) => {
+                    let image = baseline.read(scene)?;
+                    clamped.count(image.clamped);
+                    image.planes
+                }
+                Compared::Filter(filter) => {
+                    let mut file = ExrFile::open(&scene.path)?;
+                    let layout = layouts.of_filtered(&file)?;
+                    filter.denoise(&mut file, &layout)?
+                }
+            });
         }
         Ok(SceneFiles { frame, baselines })
     }
@@ -209,5 +234,37 @@ impl Scenes {
 struct SceneFiles {
     frame: Frame,
     /// In the order of the command line.
-    baselines: Vec<Rgb>,
+    baselines: Vec<Vec<f32>>,
+}
+
+/// `--baseline`: what the model is compared with.
+#[derive(Debug, Clone)]
+enum Compared {
+    /// Images in a directory.
+    Images(Baseline),
+    /// A filter that runs on each scene.
+    Filter(Filter),
+}
+
+impl Compared {
+    fn parse(text: &str) -> Result<Self, BaselineError> {
+        match Filter::from_str(text, false) {
+            Ok(filter) => Ok(Self::Filter(filter)),
+            Err(_) => text.parse().map(Self::Images),
+        }
+    }
+
+    fn name(&self) -> &str {
+        match self {
+            Self::Images(baseline) => &baseline.name,
+            Self::Filter(filter) => filter.name(),
+        }
+    }
+
+    fn images(&self) -> Option<&Baseline> {
+        match self {
+            Self::Images(baseline) => Some(baseline),
+            Self::Filter(_) => None,
+        }
+    }
 }

@@ -5,11 +5,13 @@
 mod buffers;
 mod channels;
 pub mod layers;
+mod passes;
 mod read;
 
 pub use buffers::{
     FEATURE_NAMES, FEATURES, Frame, FramePlanes, MAX_ALBEDO, POSITIONS, Presence, TEXTURES,
 };
+pub use passes::{PassPlanes, decode_passes};
 pub use read::{
     check_header, check_open_header, decode_input, decode_repaired, read_frame, read_input,
 };

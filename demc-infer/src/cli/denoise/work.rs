@@ -1,9 +1,13 @@
 //! What the images of a command share, and what is read of one.
 
 use demc_data::image::exr::ExrFile;
+use demc_data::image::frame::{decode_input, decode_repaired};
 use demc_data::input::ranges;
 use demc_data::{ChannelLayout, Frame};
 
+use crate::cli::filter::Filter;
+use crate::cli::flags::ModelFlag;
+use crate::cli::layers::read_layers;
 use crate::cli::layouts::Layouts;
 use crate::cli::progress::Progress;
 use crate::cli::record::Record;
@@ -52,12 +56,42 @@ pub(super) fn described(error: &SeamError) -> String {
 
 /// What all images of a command share.
 pub(super) struct Work<'a> {
-    pub(super) bundle: Bundle,
+    pub(super) method: Method,
     pub(super) layouts: Layouts<'a>,
     /// The options.
     pub(super) record: Record,
     pub(super) progress: Progress,
     pub(super) warnings: Warnings,
+}
+
+impl Work<'_> {
+    /// The layout of a file. A choice among the presets is passed to `say`.
+    pub(super) fn layout(
+        &self,
+        file: &ExrFile,
+        say: impl FnOnce(&str),
+    ) -> Result<ChannelLayout, demc_data::Error> {
+        match &self.method {
+            Method::Network(bundle) => self.layouts.of(file, bundle, say),
+            Method::Filter(_) => self.layouts.of_filtered(file),
+        }
+    }
+}
+
+/// What denoises.
+pub(super) enum Method {
+    Network(Box<Bundle>),
+    Filter(Filter),
+}
+
+impl Method {
+    /// Its record, without options.
+    pub(super) fn record(&self, model: &ModelFlag) -> anyhow::Result<Record> {
+        Ok(match self {
+            Self::Network(bundle) => Record::of_model(&model.short_name(), &bundle.checksum()?),
+            Self::Filter(filter) => Record::of_filter(filter.name()),
+        })
+    }
 }
 
 /// An image to denoise.
@@ -76,4 +110,32 @@ pub(super) struct Contents {
     pub(super) layers: Vec<Layer>,
     /// Number of samples that were repaired.
     pub(super) repaired: usize,
+}
+
+impl Contents {
+    /// Decodes the frame and these layers, and repairs them if wanted.
+    pub(super) fn read(
+        file: &mut ExrFile,
+        layout: &ChannelLayout,
+        names: &[String],
+        repair: bool,
+    ) -> anyhow::Result<Self> {
+        let (mut frame, repaired) = if repair {
+            decode_repaired(file, layout)?
+        } else {
+            (decode_input(file, layout)?, 0)
+        };
+        frame.name = file.path().display().to_string();
+        let (layers, more) = read_layers(file, layout, names, repair)?;
+        let alpha = layout.alpha.as_ref();
+        if alpha.is_some_and(|alpha| names.contains(alpha)) {
+            // As a layer, alpha needs no pass of its own.
+            frame.alpha = None;
+        }
+        Ok(Self {
+            frame,
+            layers,
+            repaired: repaired + more,
+        })
+    }
 }
