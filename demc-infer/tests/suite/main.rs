@@ -5,6 +5,7 @@ mod commands;
 mod common;
 mod denoise;
 mod farm;
+mod filter;
 mod fuzz_inputs;
 mod guard;
 mod inputs;
