@@ -35,6 +35,7 @@
 //! - [`buffers`]: images in a caller's memory, with any strides, as a frame.
 //! - [`denoise`]: denoises a frame of the size of any file, with [`padding`], [`tiles`] that fit into
 //!   the available [`memory`], and optional test-time augmentation ([`ensemble`](mod@ensemble)).
+//! - [`nfor`]: NFOR (Bitterli et al. 2016), a filter without a network, for comparisons.
 //! - [`guard`]: compares an image with the training data, then refuses it or warns.
 //! - [`onnx`]: exports the network for other runtimes. [`verify`](mod@verify) compares their output
 //!   with this crate's.

@@ -2,10 +2,10 @@
 
 Written from the paper (Bitterli et al. 2016) and the pseudocode in its supplement, with one loop over pixels and
 one over neighbours; weights of NL-means as in Rousselle et al. 2012. Choices where the paper is silent are marked
-"ours". `demc-infer/tests/suite/nfor.rs` compares. Takes some minutes.
+"ours". `demc-infer/src/nfor/tests.rs` compares. Takes two minutes.
 
 The file has the inputs (`color`, `normal`, `albedo`, `depth`, each with `.half1`, `.half2`, `.variance`) as float32,
-and the result as `denoised`, all `[C, H, W]`.
+the result as `denoised`, and the features of its last pass as `features`, all `[C, H, W]`.
 """
 
 from pathlib import Path
@@ -118,8 +118,9 @@ def nfor(buffers):
         mean = (filtered[0][channels] + filtered[1][channels]) / 2
         last_features.append(nl_means(mean, mean, (filtered[1][channels] - filtered[0][channels]) ** 2 / 4, 3, 2, 0.5))
     mean = (result_a + result_b) / 2
-    last = regression(mean, np.concatenate(last_features), mean, (result_b - result_a) ** 2 / 4, 1.0)
-    return np.maximum(last, 0)
+    last_features = np.concatenate(last_features)
+    last = regression(mean, last_features, mean, (result_b - result_a) ** 2 / 4, 1.0)
+    return {"denoised": np.maximum(last, 0), "features": last_features}
 
 
 def rendered(random):
@@ -155,8 +156,10 @@ def main():
         f"{name}.{kind}": np.ascontiguousarray(values, np.float32)
         for name, three in buffers.items() for kind, values in zip(("half1", "half2", "variance"), three)
     }
-    tensors["denoised"] = np.ascontiguousarray(nfor(buffers), np.float32)
-    save_file(tensors, Path(__file__).with_name("expected.safetensors"))
+    tensors |= {name: np.ascontiguousarray(values, np.float32) for name, values in nfor(buffers).items()}
+    path = Path(__file__).with_name("expected.safetensors")
+    save_file(tensors, path)
+    path.chmod(0o644)
 
 
 if __name__ == "__main__":

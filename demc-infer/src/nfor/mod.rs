@@ -43,7 +43,7 @@ const BANDWIDTHS: [f32; 2] = [0.5, 1.0];
 const LAST_BANDWIDTH: f32 = 1.0;
 
 /// Memory for each pixel in bytes, beside the buffers (ours, measured).
-const BYTES_PER_PIXEL: u64 = 260;
+const BYTES_PER_PIXEL: u64 = 320;
 
 /// A rendered buffer, `[C, H, W]` each.
 #[derive(Debug, Clone, PartialEq)]

@@ -1,6 +1,6 @@
-//! Collaborative first-order regression (Sec. 4 and 5.2): in the window around each pixel, the colour is
-//! fitted by a linear function of features and place, with the weights of NL-means. The fit serves all
-//! pixels of the window: each pixel gets the weighted mean of all fits that it is part of.
+//! Collaborative first-order regression (Sec. 4 and 5.2). In the window around each pixel, a linear
+//! function of features and place fits the colour, with the weights of NL-means. The fit serves all pixels
+//! of the window: each pixel gets the weighted mean of all fits that it is part of.
 
 use multiversion::multiversion;
 use rayon::prelude::*;

@@ -10,8 +10,8 @@ pub(super) const COLUMNS: usize = 10;
 pub(super) const ALL: usize = COLUMNS + COLORS;
 /// Right-hand sides.
 pub(super) const COLORS: usize = 3;
-/// Added to the squares of columns of length 1, so that columns that hardly differ from others do not
-/// get large coefficients (ours: the paper is silent; float32 sums have errors of about 1e-6).
+/// Added to the squares of columns of length 1 (ours: the paper is silent). Columns that hardly differ from
+/// others then get no large coefficients; float32 sums have errors of about 1e-6.
 const RIDGE: f32 = 1e-4;
 
 /// The sums of weighted products of columns i and j, `[i][j]`: those with j >= i count.

@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use safetensors::SafeTensors;
 
-use super::{Buffer, Buffers};
+use super::{Buffer, Buffers, features_again};
 
 const EXPECTED: &[u8] = include_bytes!("../../../tests/nfor/expected.safetensors");
 
@@ -37,6 +37,16 @@ fn inputs(file: &SafeTensors) -> Buffers {
 }
 
 #[test]
+fn numpy_gives_the_same_features() {
+    let file = SafeTensors::deserialize(EXPECTED).expect("a safetensors file");
+    let found = features_again(inputs(&file).filtered_features());
+    let expected = tensor(&file, "features");
+    // The depth is 7: ten times its last bit.
+    let worst = largest_difference(&found.samples, &expected);
+    assert!(worst < 1e-5, "{worst}");
+}
+
+#[test]
 fn numpy_gives_the_same_image() {
     let file = SafeTensors::deserialize(EXPECTED).expect("a safetensors file");
     let (found, expected) = (
@@ -44,8 +54,8 @@ fn numpy_gives_the_same_image() {
         tensor(&file, "denoised"),
     );
     assert_eq!(found.len(), expected.len());
-    // float32 against float64: sums of about 1e-6 are divided by the ridge, 1e-4, where columns hardly differ
-    // from others, and the choice of a bandwidth turns where both errors are equal. Most pixels have neither.
+    // The error of float32 has two places. Where columns hardly differ from others, sums with an error of
+    // about 1e-6 are divided by the ridge, 1e-4. Where both bandwidths have equal errors, the choice turns.
     let largest = expected.iter().fold(0.0_f32, |a, b| a.max(*b));
     let differences = found
         .iter()

@@ -128,8 +128,8 @@ impl Guide<'_> {
     }
 }
 
-/// One divided by the number of a patch's places along one axis that are in `range`, for each pixel of a
-/// tile; infinite where pixel or neighbour are outside.
+/// For each pixel of a tile, one divided by the number of its patch's places along one axis that are in
+/// `range`. Infinite where pixel or neighbour are outside.
 fn shares(
     start: usize,
     shift: isize,

@@ -11,8 +11,8 @@ use demc_data::image::exr::merge::{MergeInput, merge};
 use demc_data::image::rewrite::RECORD;
 use serde_json::Value;
 
-/// A data set of one scene with passes and its layout: a sample image that stands for both half buffers, for
-/// variances, and, by its mask, for the depth.
+/// A data set of one scene with passes, and its layout. A sample image stands for both half buffers and for
+/// variances, and its mask for the depth.
 fn data_set(root: &Path) -> (PathBuf, PathBuf) {
     let stock = sample_image("col-classroom-1.exr");
     let input = |prefix: Option<&str>| MergeInput {
