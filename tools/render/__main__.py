@@ -10,6 +10,7 @@
     python tools/render -o data/rooms --rooms 60 --shard 1/4         a part, on a farm (docs/farms.md)
     python tools/render -o data/bundled --preset train               the training data of the bundled models
     python tools/render -o data/heldout --preset heldout             their test scenes
+    python tools/render -o data/comparison --preset comparison       the scenes of the paper's comparison
 
 Existing images are kept: rerun a command to resume it. Mitsuba needs LLVM's shared library (Debian:
 libllvm19); DRJIT_LIBLLVM_PATH names it if Mitsuba does not find it.
@@ -27,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 import views
+from comparison import ComparisonRoom, ComparisonStill, GlassBalls
 from reserved import ReservedRoom, ReservedStill
 from rooms import Room
 from stills import Still
@@ -48,14 +50,27 @@ NEAR, STILL_NEAR = 0.5, 0.15
 COUNTS = [1, 2, 4, 8, 16, 32, 64, 128, 256]
 REPEATS = {16: 2, 64: 6}
 """How often an epoch takes the images of at least so many samples per pixel: with --counts, they are few."""
-PRESETS = {
-    "train": {"rooms": 680, "stills": 380, "size": 192, "spp": COUNTS, "counts": 3, "traits": 0.25, "seed": 29},
-    "heldout": {
-        "rooms": 78, "stills": 20, "views": 1, "size": 192, "spp": COUNTS[::2], "ref_spp": 2048, "residual": 0.0,
-        "reserved": True, "split": "test", "seed": 1029,
-    },
+EDITIONS = {
+    "train": (Room, Still),
+    "heldout": (ReservedRoom, ReservedStill),
+    "comparison": (ComparisonRoom, ComparisonStill),
+    "glass": (ComparisonRoom, GlassBalls),
 }
-"""Options of `--preset`."""
+"""The rooms and still lifes of `--edition`."""
+TRAINING = {"rooms": 680, "stills": 380, "size": 192, "spp": COUNTS, "counts": 3, "traits": 0.25, "seed": 29}
+TEST = {"views": 1, "size": 192, "residual": 0.0, "split": "test"}
+HELD_OUT = TEST | {"rooms": 78, "stills": 20, "spp": COUNTS[::2], "ref_spp": 2048, "edition": "heldout", "seed": 1029}
+COMPARISON = {"edition": "comparison", "passes": "paper"}
+PRESETS = {
+    "train": [TRAINING],
+    "heldout": [HELD_OUT],
+    "comparison": [
+        COMPARISON | {"rooms": 170, "stills": 80, "size": 192, "seed": 2029},
+        COMPARISON | TEST | {"rooms": 110, "stills": 40, "ref_spp": 1024, "seed": 3029},
+        COMPARISON | TEST | {"stills": 10, "ref_spp": 1024, "edition": "glass", "seed": 4029},
+    ],
+}
+"""Options of `--preset`, part by part."""
 
 
 @dataclass
@@ -70,7 +85,12 @@ class Base:
 
 
 def main() -> None:
-    args = arguments()
+    for args in arguments():
+        render(args)
+
+
+def render(args: argparse.Namespace) -> None:
+    """Renders one part of a preset, or what the options ask for."""
     folder = args.output / args.split
     folder.mkdir(parents=True, exist_ok=True)
     budget = views.Budget(args.ref_spp, args.residual)
@@ -158,7 +178,7 @@ def furnished_room(args, index: int) -> tuple[Room, np.random.Generator]:
     """A room, and the random generator for its cameras."""
     rng = np.random.default_rng([args.seed, index])
     # Separate generators: the room stays the same without grain, sun, or black.
-    kind = ReservedRoom if args.reserved else Room
+    kind, _ = EDITIONS[args.edition]
     room = kind(rng, args.grain, np.random.default_rng([args.seed, index, 2]))
     outside = np.random.default_rng([args.seed, index, 1])
     if outside.random() < args.sun:
@@ -172,7 +192,7 @@ def furnished_room(args, index: int) -> tuple[Room, np.random.Generator]:
 def still_life(args, index: int) -> tuple[Still, np.random.Generator]:
     """A still life, and the random generator for its cameras."""
     rng = np.random.default_rng([args.seed, index, 4])
-    kind = ReservedStill if args.reserved else Still
+    _, kind = EDITIONS[args.edition]
     still = kind(rng, args.grain, np.random.default_rng([args.seed, index, 5]))
     lamps = np.random.default_rng([args.seed, index, 6])
     if lamps.random() < args.studio:
@@ -208,7 +228,8 @@ def numbers(text: str) -> list[int]:
     return found
 
 
-def arguments() -> argparse.Namespace:
+def arguments() -> list[argparse.Namespace]:
+    """The options of each part."""
     whole = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("python tools/render", description=__doc__, formatter_class=whole)
     parser.add_argument("scenes", nargs="*", type=Path, metavar="SCENE.xml", help="Mitsuba scenes to render")
@@ -227,15 +248,25 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--passes", choices=("paper",), help="also write what the paper's comparison needs: half buffers, variances, depth, diffuse and specular parts")
     parser.add_argument("--ref-spp", type=int, default=128, metavar="N", help="largest number of samples per pixel of the reference [128]")
     parser.add_argument("--residual", type=float, default=0.03, metavar="X", help="expected RelMSE at which a reference is good enough [0.03]")
-    parser.add_argument("--reserved", action="store_true", help="furniture, textures, and lights that rooms and still lifes do not have otherwise")
+    parser.add_argument("--edition", choices=[*EDITIONS], default="train", help="furniture, textures, and lights: of training, of the held-out set, of the paper's comparison, or glass balls; no two share any [train]")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of rooms, still lifes, and samples [1]")
     parser.add_argument("--split", choices=("train", "test"), default="train", help="split of the rendered views [train]")
     parser.add_argument("--with", dest="beside", action="append", default=[], type=Path, metavar="DIR", help="data set whose scenes are also listed; can be repeated")
-    parser.add_argument("--preset", choices=[*PRESETS], help="training data or test scenes of the bundled models; other options change it")
+    parser.add_argument("--preset", choices=[*PRESETS], help="training data or test scenes of the bundled models, or the scenes of the paper's comparison; other options change it")
     add_shard_flag(parser, "views")
-    if preset := parser.parse_known_args()[0].preset:
-        parser.set_defaults(**PRESETS[preset])
-    args = parser.parse_args()
+    parts = []
+    for options in PRESETS.get(parser.parse_known_args()[0].preset, [{}]):
+        initial = {name: parser.get_default(name) for name in options}
+        parser.set_defaults(**options)
+        parts.append(parser.parse_args())
+        parser.set_defaults(**initial)
+    for args in parts:
+        check(parser, args)
+    return parts
+
+
+def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Ends with an error for options that do not fit."""
     if not args.scenes and args.rooms < 1 and args.stills < 1:
         parser.error("nothing to render: --rooms N, --stills N, or SCENE.xml")
     stems = [path.stem for path in args.scenes]
@@ -243,7 +274,6 @@ def arguments() -> argparse.Namespace:
         parser.error("two scene files have the same name")
     if args.passes and (args.traits or any(count % 2 for count in args.spp)):
         parser.error("--passes needs --traits 0 and even numbers of --spp, for two halves")
-    return args
 
 
 if __name__ == "__main__":

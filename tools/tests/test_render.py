@@ -377,6 +377,7 @@ class Render(unittest.TestCase):
         np.testing.assert_array_equal(views.filtered(noise, 0.0), noise)
 
     def test_training_and_held_out_scenes_draw_different_things(self) -> None:
+        import comparison
         import numpy as np
         import reserved
         from rooms import Room
@@ -407,11 +408,32 @@ class Render(unittest.TestCase):
 
         training = called(Room, Still)
         held_out = called(reserved.ReservedRoom, reserved.ReservedStill)
+        compared = called(comparison.ComparisonRoom, comparison.ComparisonStill) | called(comparison.ComparisonRoom, comparison.GlassBalls)
         self.assertEqual(training & held_out, SHARED)
-        own = [value for value in vars(reserved).values() if getattr(value, "__module__", "") == "reserved"]
-        functions = {function.__qualname__ for function in own if not isinstance(function, type)}
-        functions |= {f"{kind.__name__}.{name}" for kind in own if isinstance(kind, type) for name, value in vars(kind).items() if callable(value) and not isinstance(value, staticmethod)}
-        self.assertEqual(functions - held_out, set())
+        self.assertEqual(held_out & compared, SHARED)
+        self.assertEqual(training & compared, SHARED)
+        for module, drawn in ((reserved, held_out), (comparison, compared)):
+            own = [value for value in vars(module).values() if getattr(value, "__module__", "") == module.__name__]
+            functions = {function.__qualname__ for function in own if not isinstance(function, type)}
+            functions |= {f"{kind.__name__}.{name}" for kind in own if isinstance(kind, type) for name, value in vars(kind).items() if callable(value) and not isinstance(value, staticmethod)}
+            self.assertEqual(functions - drawn, set())
+
+    def test_the_comparison_has_three_parts(self) -> None:
+        import OpenEXR
+
+        with tempfile.TemporaryDirectory() as empty:
+            out = Path(empty) / "set"
+            ended = run("-o", out, "--preset", "comparison", "--rooms", 1, "--stills", 1, "--views", 1, "--size", SIDE, "--ref-spp", 16)
+            self.assertEqual(ended.returncode, 0, ended.stderr)
+            manifest = json.loads((out / "manifest.json").read_text())
+            scenes = manifest["scenes"]
+            views = {scene["name"]: scene["split"] for scene in scenes} | dict.fromkeys(manifest["left_out"], "left out")
+            expected = {f"{kind}-{seed}-0-0" for kind in ("room", "still") for seed in (2029, 3029, 4029)}
+            self.assertEqual({*views}, expected)
+            self.assertEqual(views["still-2029-0-0"], "train")
+            self.assertEqual(views["still-4029-0-0"], "test")
+            with OpenEXR.File(str(out / scenes[0]["file"]), separate_channels=True) as file:
+                self.assertIn("half1.R", file.channels())
 
     def test_a_shard_outside_1_to_n_is_an_error(self) -> None:
         for part in ("0/4", "5/4", "x"):

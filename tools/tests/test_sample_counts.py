@@ -14,7 +14,7 @@ from test_render import MISSING, run
 
 ROOT = Path(__file__).resolve().parents[2]
 COUNTS = (1, 4, 16, 64, 256)
-SCENES = ("--rooms", 2, "--stills", 1, "--views", 1, "--reserved", "--split", "test", "--seed", 8, "--size", 96)
+SCENES = ("--rooms", 2, "--stills", 1, "--views", 1, "--edition", "heldout", "--split", "test", "--seed", 8, "--size", 96)
 
 
 @unittest.skipIf(MISSING and os.environ.get("DEMC_REQUIRE_MITSUBA") != "1", f"no {', '.join(MISSING)}")
