@@ -55,7 +55,7 @@ fn an_unusable_interpreter_is_a_one_line_error_with_advice() {
             "python -m pip install numpy onnxruntime): No module named 'onnxruntime'",
         ),
         ("echo one >&2; echo two >&2; exit 1", "/python: two"),
-        ("cat > /dev/null", "No such file"),
+        ("cat > /dev/null", "0 values instead of 3072"),
         (
             "cat > /dev/null; for i in 0 1 2 3; do : > \"$5/$i.output\"; done",
             "0 values instead of 3072",
