@@ -91,11 +91,9 @@ fn other_patches_per_epoch_are_refused() {
     assert!(kill_after(&config, &run, &args, 1));
     let manifest = data.join("manifest.json");
     let text = fs::read_to_string(&manifest).expect("a manifest");
-    let repeated = text.replacen(
-        "\"split\": \"train\"",
-        "\"split\": \"train\", \"repeat\": 3",
-        1,
-    );
+    // Of all scenes, because some are held out.
+    let split = "\"split\": \"train\"";
+    let repeated = text.replace(split, &format!("{split}, \"repeat\": 3"));
     assert_ne!(repeated, text);
     fs::write(&manifest, repeated).expect("written");
     let error = error_line(
