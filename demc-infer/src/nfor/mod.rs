@@ -3,7 +3,7 @@
 //! those of that paper.
 //!
 //! 1. Features are filtered by NL-means, each half with weights of the other half (Sec. 5.1).
-//! 2. A [regression](regression) fits each half of the colour, with weights and features of the other
+//! 2. A regression fits each half of the colour, with weights and features of the other
 //!    half, for two bandwidths (Sec. 5.2).
 //! 3. Errors of both are estimated from the halves and filtered. The bandwidth of the smaller error is
 //!    chosen for each pixel, and the choice filtered (Sec. 5.3).
