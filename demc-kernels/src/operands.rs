@@ -1,5 +1,7 @@
 //! The operands of convolutions by name.
 
+use crate::Grid;
+
 /// A convolution and the ReLU after it.
 ///
 /// # Shapes
@@ -59,4 +61,31 @@ pub struct GradientTarget<'a, X = Option<&'a mut [f32]>> {
     pub dweight: &'a mut [f32],
     /// With respect to the bias.
     pub dbias: &'a mut [f32],
+}
+
+/// The number of input channels of a convolution that keeps the size, with kernels of `taps` values.
+/// `x` and `y` are the lengths of input and output.
+///
+/// # Panics
+/// If a length does not match the others.
+#[track_caller]
+pub(crate) fn check_lengths(
+    grid: Grid,
+    [x, y]: [usize; 2],
+    weight: usize,
+    outputs: usize,
+    taps: usize,
+) -> usize {
+    let inputs = grid.channels(x);
+    assert_eq!(
+        y,
+        grid.pixels() * outputs,
+        "an output of {outputs} channels on {grid:?}"
+    );
+    assert_eq!(
+        weight,
+        outputs * inputs * taps,
+        "a weight of {inputs} to {outputs} channels"
+    );
+    inputs
 }

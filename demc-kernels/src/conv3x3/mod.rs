@@ -8,6 +8,7 @@ mod tests;
 mod thin;
 mod winograd;
 
+use crate::operands::check_lengths;
 use crate::{Convolution, GradientSource, GradientTarget, Grid, Isa};
 use parts::{Axes, BiasRelu, GatedMap, ThinConvolution};
 
@@ -40,7 +41,7 @@ fn is_wide(inputs: usize, outputs: usize) -> bool {
 /// If a length does not match the others.
 pub fn forward(isa: Isa, grid: Grid, x: &[f32], convolution: Convolution, y: &mut [f32]) {
     let Convolution { weight, bias, .. } = convolution;
-    check(grid, x.len(), weight.len(), bias.len(), y.len());
+    check_lengths(grid, [x.len(), y.len()], weight.len(), bias.len(), 9);
     PreparedConvolution::new(isa, Tile::F2, convolution).forward(grid, x, 0, y);
 }
 
@@ -159,7 +160,8 @@ impl<'a> PreparedConvolution<'a> {
 pub fn backward(isa: Isa, grid: Grid, x: &[f32], source: GradientSource, target: GradientTarget) {
     let GradientSource { weight, y, dy } = source;
     let GradientTarget { dx, dweight, dbias } = target;
-    let (inputs, outputs) = check(grid, x.len(), weight.len(), dbias.len(), dy.len());
+    let outputs = dbias.len();
+    let inputs = check_lengths(grid, [x.len(), dy.len()], weight.len(), outputs, 9);
     assert_eq!(dweight.len(), weight.len(), "a weight's gradient");
     assert!(
         y.is_none_or(|y| y.len() == dy.len()),
@@ -198,19 +200,4 @@ pub fn backward(isa: Isa, grid: Grid, x: &[f32], source: GradientSource, target:
         }
         thin::gradient(isa, grid, x, dy, dweight, dbias);
     }
-}
-
-fn check(grid: Grid, x: usize, weight: usize, outputs: usize, y: usize) -> (usize, usize) {
-    let inputs = grid.channels(x);
-    assert_eq!(
-        y,
-        grid.pixels() * outputs,
-        "an output of {outputs} channels on {grid:?}"
-    );
-    assert_eq!(
-        weight,
-        outputs * inputs * 9,
-        "a weight of {inputs} to {outputs} channels"
-    );
-    (inputs, outputs)
 }

@@ -9,6 +9,7 @@ mod tests;
 
 use rayon::prelude::*;
 
+use crate::operands::check_lengths;
 use crate::rows::{self, BLOCK, Outer, Packed, Term, whole};
 use crate::{Convolution, GradientSource, GradientTarget, Grid, Isa};
 use padded::{PaddedMap, SIDE};
@@ -26,7 +27,7 @@ const TAPS: usize = SIDE * SIDE;
 pub fn forward(isa: Isa, grid: Grid, x: &[f32], convolution: Convolution, y: &mut [f32]) {
     let Convolution { weight, bias, relu } = convolution;
     let outputs = bias.len();
-    let inputs = check(grid, [x.len(), y.len()], weight.len(), outputs);
+    let inputs = check_lengths(grid, [x.len(), y.len()], weight.len(), outputs, TAPS);
     let isa = isa.for_channels(outputs);
     let x = PaddedMap::new(isa, grid, x, None, [inputs, inputs]);
     let weights = kernel_rows(isa, inputs, outputs, |input, output, tap| {
@@ -43,7 +44,7 @@ pub fn backward(isa: Isa, grid: Grid, x: &[f32], source: GradientSource, target:
     let GradientSource { weight, y, dy } = source;
     let GradientTarget { dx, dweight, dbias } = target;
     let outputs = dbias.len();
-    let inputs = check(grid, [x.len(), dy.len()], weight.len(), outputs);
+    let inputs = check_lengths(grid, [x.len(), dy.len()], weight.len(), outputs, TAPS);
     assert_eq!(dweight.len(), weight.len(), "a weight's gradient");
     assert!(
         y.is_none_or(|y| y.len() == dy.len()),
@@ -152,20 +153,4 @@ fn weight_gradient(isa: Isa, x: &PaddedMap, gated: &PaddedMap, dweight: &mut [f3
                 *dweight = images.map(|product| product[line * wide + output]).sum();
             }
         });
-}
-
-/// The number of input channels.
-fn check(grid: Grid, [x, y]: [usize; 2], weight: usize, outputs: usize) -> usize {
-    let inputs = grid.channels(x);
-    assert_eq!(
-        y,
-        grid.pixels() * outputs,
-        "an output of {outputs} channels on {grid:?}"
-    );
-    assert_eq!(
-        weight,
-        outputs * inputs * TAPS,
-        "a weight of {inputs} to {outputs} channels"
-    );
-    inputs
 }

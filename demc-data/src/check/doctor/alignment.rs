@@ -22,8 +22,8 @@ const SAME_NOISE: f64 = 0.55;
 /// Ratio of the median variances of both albedos above which they are exchanged (renders: 1.5). The one of the
 /// second hit has the noise of a random bounce.
 const NOISIER: f64 = 2.2;
-/// Correlation of neighbouring details below which they are noise (textures of renders of 16 and 64 samples
-/// per pixel, and of quarters of renders: above 0.13; second hits at 4: 95 % below).
+/// Correlation of neighbouring details below which they are noise. Textures have more than 0.13: renders of
+/// 16 and 64 samples per pixel, and quarters of renders. At 4 samples, 95 % of the second hits have less.
 const WHITE: f64 = 0.1;
 /// Variance that is added to both.
 const ROUNDING: f64 = 1e-6;

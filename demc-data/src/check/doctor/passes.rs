@@ -185,8 +185,8 @@ impl PassPlanes {
         findings
     }
 
-    /// By how much the variance of the colour is outside the bounds that those of its parts set: the squares of
-    /// the sum and of the difference of their standard deviations (Cauchy and Schwarz).
+    /// By how much the variance of the colour is outside the bounds that its parts set. These are the squares
+    /// of the sum and of the difference of their standard deviations (Cauchy and Schwarz).
     fn misfit_of_parts(&self) -> Option<String> {
         let get = |content: &str| self.get(&format!("variance of {content}"));
         let (whole, a, b) = (get("color")?, get("diffuse")?, get("specular")?);
