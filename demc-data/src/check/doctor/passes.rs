@@ -114,48 +114,15 @@ impl PassPlanes {
                 add(format!("{content} is negative"), cause, String::new());
             }
         }
-        let mut color_fits = true;
-        for buffer in ["color", "normal", "texture1", "depth"] {
-            let half = |number| self.get(&format!("half buffer {number} of {buffer}"));
-            let (Some(whole), Some(a), Some(b)) = (self.get(buffer), half(1), half(2)) else {
-                continue;
-            };
-            if a == b && a.iter().any(|sample| *sample != a[0]) {
-                let cause = "render them with different seeds";
-                add(
-                    format!("the half buffers of {buffer} are equal"),
-                    cause,
-                    String::new(),
-                );
-                continue;
-            }
-            let away = deviation(whole, a, b, 0.5);
-            if away > SUM_TOLERANCE {
-                let cause = "each must have one half of the samples of the image";
-                let detail = format!("off by {:.0} %", 100.0 * away);
-                add(
-                    format!("{buffer} is not the mean of its half buffers"),
-                    cause,
-                    detail,
-                );
-                continue;
-            }
-            let Some(variance) = self.get(&format!("variance of {buffer}")) else {
-                continue;
-            };
-            let ratio = mean(variance.iter().map(|x| f64::from(*x)))
-                / mean(
-                    a.iter()
-                        .zip(b)
-                        .map(|(a, b)| f64::from((a - b) / 2.0).powi(2)),
-                );
-            if !(VARIANCE[0]..=VARIANCE[1]).contains(&ratio) {
-                color_fits &= buffer != "color";
-                let cause = "it must be that of the mean: of the samples, divided by their number";
-                let detail = format!("{ratio:.2} times that of its half buffers");
-                add(format!("variance of {buffer} does not fit"), cause, detail);
-            }
-        }
+        findings.extend(
+            ["color", "normal", "texture1", "depth"]
+                .into_iter()
+                .filter_map(|buffer| self.misfit_of_halves(scene, buffer)),
+        );
+        let mut add = |problem: String, cause: &str, detail: String| {
+            findings.push(Finding::new(&problem, cause, scene, detail));
+        };
+        let color_fits = !self.has_other_variance("color");
         if let Some(detail) = self.misfit_of_parts().filter(|_| color_fits) {
             let cause = "each must be that of the mean: of the samples, divided by their number";
             let problem = "variances of diffuse and specular do not fit that of color";
@@ -183,6 +150,51 @@ impl PassPlanes {
             }
         }
         findings
+    }
+
+    /// How a buffer, its half buffers, and its variance do not fit each other.
+    fn misfit_of_halves(&self, scene: &str, buffer: &str) -> Option<Finding> {
+        let found = |problem: String, cause: &str, detail: String| {
+            Some(Finding::new(&problem, cause, scene, detail))
+        };
+        let [a, b] = self.halves(buffer)?;
+        if a == b && a.iter().any(|sample| *sample != a[0]) {
+            let problem = format!("the half buffers of {buffer} are equal");
+            return found(problem, "render them with different seeds", String::new());
+        }
+        let away = deviation(self.get(buffer)?, a, b, 0.5);
+        if away > SUM_TOLERANCE {
+            let cause = "each must have one half of the samples of the image";
+            let problem = format!("{buffer} is not the mean of its half buffers");
+            return found(problem, cause, format!("off by {:.0} %", 100.0 * away));
+        }
+        if self.has_other_variance(buffer) {
+            let cause = "it must be that of the mean: of the samples, divided by their number";
+            let ratio = self.variance_ratio(buffer)?;
+            let detail = format!("{ratio:.2} times that of its half buffers");
+            return found(format!("variance of {buffer} does not fit"), cause, detail);
+        }
+        None
+    }
+
+    fn halves(&self, buffer: &str) -> Option<[&[f32]; 2]> {
+        let half = |number| self.get(&format!("half buffer {number} of {buffer}"));
+        Some([half(1)?, half(2)?])
+    }
+
+    /// The mean variance of a buffer, in units of that of its half buffers; NaN if both are 0.
+    fn variance_ratio(&self, buffer: &str) -> Option<f64> {
+        let variance = self.get(&format!("variance of {buffer}"))?;
+        let [a, b] = self.halves(buffer)?;
+        let pairs = a.iter().zip(b);
+        let squares = pairs.map(|(a, b)| f64::from((a - b) / 2.0).powi(2));
+        Some(mean(variance.iter().map(|x| f64::from(*x))) / mean(squares))
+    }
+
+    fn has_other_variance(&self, buffer: &str) -> bool {
+        let ratio = self.variance_ratio(buffer);
+        let is_other = |ratio: f64| !(VARIANCE[0]..=VARIANCE[1]).contains(&ratio);
+        ratio.is_some_and(|ratio| !ratio.is_nan() && is_other(ratio))
     }
 
     /// By how much the variance of the colour is outside the bounds that its parts set. These are the squares
