@@ -1,13 +1,12 @@
 //! SHA-256 checksums in hexadecimal digits, as `sha256sum` prints them.
 
 use std::fmt::Write as _;
-use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
-use crate::file::FileError;
+use crate::file::{FileError, open_regular};
 
 /// Bytes that are read at once.
 const PIECE: usize = 1 << 20;
@@ -24,10 +23,10 @@ pub fn sha256<'a>(parts: impl IntoIterator<Item = &'a [u8]>) -> String {
 /// The SHA-256 of a file: 64 hexadecimal digits.
 ///
 /// # Errors
-/// [`FileError::Read`] for a file that cannot be read.
+/// [`FileError::Read`] for a file that cannot be read or is not a regular file.
 pub fn sha256_of(path: &Path) -> Result<String, FileError> {
     let read = || -> io::Result<String> {
-        let mut file = File::open(path)?;
+        let mut file = open_regular(path)?;
         let (mut sum, mut piece) = (Sha256::new(), vec![0; PIECE]);
         loop {
             match file.read(&mut piece)? {
@@ -62,6 +61,8 @@ mod tests {
         let expected = "7902699be42c8a8e46fbbb4501726517e86b22c56a189f7625a6da49081b2451";
         assert_eq!(sha256_of(file.path()).expect("read"), expected);
         assert_eq!(sha256([&b""[..], b"7"]), expected);
-        assert!(sha256_of(Path::new("/nowhere/at/all")).is_err());
+        for path in ["/nowhere/at/all", "/dev/zero"] {
+            assert!(sha256_of(Path::new(path)).is_err());
+        }
     }
 }

@@ -28,6 +28,20 @@ pub enum FileError {
     Write { path: PathBuf, source: io::Error },
 }
 
+/// Opens a regular file to read it. Opening a FIFO would wait for a writer, and a device may not end.
+///
+/// # Errors
+/// A file that cannot be opened or is not a regular file.
+pub fn open_regular(path: &Path) -> io::Result<File> {
+    if fs::metadata(path)?.is_file() {
+        return File::open(path);
+    }
+    Err(io::Error::new(
+        io::ErrorKind::InvalidInput,
+        "not a regular file",
+    ))
+}
+
 /// What a file is, whatever its path: hard and symbolic links to it have the same id.
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum FileId {

@@ -1,4 +1,5 @@
 """Item 5: a resume names the scenes whose files changed."""
+import hashlib
 import json
 
 from common import Attack, write_exr, write_manifest
@@ -65,5 +66,7 @@ class Scenes(Attack):
             self.assertEqual(sorted(record.pop("checksums")), sorted(name for name, _ in self.scenes))
             path.write_text(json.dumps(record))
         sums = checkpoint / "SHA256SUMS"
-        sums.write_text("".join(line for line in sums.read_text().splitlines(True) if "run.json" not in line))
+        names = [line.split("  ")[1] for line in sums.read_text().splitlines()]
+        sums.write_text("".join(
+            f"{hashlib.sha256((checkpoint / name).read_bytes()).hexdigest()}  {name}\n" for name in names))
         self.assertEqual(self.train("--resume").code, 0)

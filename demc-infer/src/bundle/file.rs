@@ -1,13 +1,13 @@
 //! Reads a bundle file: header and tensors, without building the network.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use demc_data::image::frame::FEATURE_NAMES;
 use demc_model::kernel_head::GAMMA;
 use demc_model::{Head, Weight};
+use demc_program::file::open_regular;
 use demc_program::message::printable;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, Metadata};
@@ -150,12 +150,7 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>, BundleError> {
         path: path.into(),
         source,
     };
-    // Opening a FIFO would wait for a writer.
-    if !fs::metadata(path).map_err(failed)?.is_file() {
-        let source = io::Error::new(io::ErrorKind::InvalidInput, "not a regular file");
-        return Err(failed(source));
-    }
-    let mut file = File::open(path).map_err(failed)?;
+    let mut file = open_regular(path).map_err(failed)?;
     let mut bytes = Vec::new();
     let mut more = |bytes: &mut Vec<u8>, count: u64| -> io::Result<()> {
         file.by_ref().take(count).read_to_end(bytes).map(|_| ())

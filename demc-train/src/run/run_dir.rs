@@ -18,6 +18,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
 use demc_infer::bundle::locate::{BEST, LATEST};
+use demc_program::exit::UsageError;
 use demc_program::file::{remove_abandoned, write_whole};
 
 use crate::config::Config;
@@ -69,11 +70,12 @@ impl RunDir {
         let trace = OWN_FILES.iter().chain(&TRACES);
         let Some(trace) = trace.into_iter().find(|name| path.join(name).exists()) else {
             if let Some(file) = replaced_files(&path).iter().find(|file| file.exists()) {
-                bail!(
+                let problem = format!(
                     "{}: belongs to no run, and a run would replace it; move it, or name another directory \
                      with --run-dir",
                     file.display()
                 );
+                return Err(UsageError(problem).into());
             }
             return Ok(dir);
         };

@@ -70,7 +70,7 @@ fn a_file_that_belongs_to_no_run_is_kept() {
         let path = run.join(name);
         fs::create_dir_all(path.parent().expect("a directory")).expect("a directory");
         fs::write(&path, "mine").expect("written");
-        let error = error_line(&train(&config, &run, &["--set=train.steps=1"]), 1);
+        let error = error_line(&train(&config, &run, &["--set=train.steps=1"]), 2);
         assert!(
             error.contains(&format!("{name}: belongs to no run")),
             "{error}"

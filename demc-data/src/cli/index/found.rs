@@ -43,7 +43,7 @@ pub(super) fn exr_files(root: &Path) -> Result<(Vec<PathBuf>, usize)> {
             let kind = entry.file_type().ok();
             if kind.is_some_and(|kind| kind.is_dir()) && !hidden {
                 directories.push(relative);
-            } else if is_exr && !hidden && entry.path().is_file() {
+            } else if is_exr && !hidden && !entry.path().is_dir() {
                 files.push(relative);
             } else if relative != Path::new("manifest.json") {
                 ignored += 1;

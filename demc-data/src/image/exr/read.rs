@@ -1,8 +1,8 @@
 //! The headers of a file and, on demand, its channels.
 
 use std::collections::{BTreeSet, HashMap};
-use std::fs::{self, File};
-use std::io::{self, BufReader, Read, Seek};
+use std::fs::File;
+use std::io::{BufReader, Read, Seek};
 use std::path::{Path, PathBuf};
 
 use ::exr::block::UncompressedBlock;
@@ -10,7 +10,7 @@ use ::exr::error::Error as ExrError;
 use ::exr::meta::attribute::{AttributeValue, SampleType, Text};
 use ::exr::meta::header::Header;
 use ::exr::prelude::Vec2;
-use demc_program::file::FileError;
+use demc_program::file::{FileError, open_regular};
 use demc_program::parallel;
 use half::f16;
 
@@ -44,12 +44,7 @@ impl ExrFile {
             path: path.to_owned(),
             source,
         };
-        // Opening a FIFO would wait for a writer; reading a device may not end.
-        if !fs::metadata(path).map_err(read_error)?.is_file() {
-            let why = io::Error::new(io::ErrorKind::InvalidInput, "not a regular file");
-            return Err(read_error(why).into());
-        }
-        let file = File::open(path).map_err(read_error)?;
+        let file = open_regular(path).map_err(read_error)?;
         Self::parse(path, BufReader::new(file))
     }
 }

@@ -213,7 +213,8 @@ fn sync(dir: &Path) -> anyhow::Result<()> {
     sync_dir(dir).with_context(|| dir.display().to_string())
 }
 
-/// Fails with the first file that does not match its checksum, or has none.
+/// Fails with the first file that does not match its checksum, or has none. Hidden files are those of
+/// a file system or a desktop, such as `.nfs0001`.
 fn verify(dir: &Path) -> anyhow::Result<()> {
     let sums = sums(dir)?;
     for (sum, name) in &sums {
@@ -222,10 +223,11 @@ fn verify(dir: &Path) -> anyhow::Result<()> {
             bail!("{}: damaged, its checksum differs", file.display());
         }
     }
-    let is_listed = |file: &String| sums.iter().any(|(_, name)| name == file);
+    let is_ours = |file: &str| file != SUMS && !file.starts_with('.');
+    let is_listed = |file: &str| sums.iter().any(|(_, name)| name == file);
     let unlisted = names_in(dir)?
         .into_iter()
-        .find(|file| file != SUMS && !is_listed(file));
+        .find(|file| is_ours(file) && !is_listed(file));
     if let Some(file) = unlisted {
         bail!("{}: no checksum in {SUMS}", dir.join(file).display());
     }
@@ -296,6 +298,8 @@ mod tests {
     fn a_damaged_checkpoint_is_named_and_the_previous_one_used() {
         let (dir, store) = run(&[5, 6], 2);
         let dir_of = |step: u64| store.all().join(format!("step-{step:08}"));
+        assert_eq!(store.newest_intact().unwrap().intact, Some(dir_of(6)));
+        fs::write(dir_of(6).join(".nfs0001"), "").unwrap();
         assert_eq!(store.newest_intact().unwrap().intact, Some(dir_of(6)));
         fs::write(dir_of(6).join("a file"), "7").unwrap();
         let found = store.newest_intact().unwrap();
