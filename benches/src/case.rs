@@ -96,10 +96,11 @@ pub fn input(batch: usize, height: usize, width: usize) -> CaseInput {
     let batch = Batch {
         size: batch,
         patch_size: width,
-        color_gamma: draw(3, 0.0, 1.5),
-        features_z: draw(FEATURES, -1.7, 1.7),
+        color: draw(3, 0.0, 1.5),
+        features: draw(FEATURES, -1.7, 1.7),
         modulation: None,
         reference_hdr: draw(3, 0.2, 2.0),
+        reference_light: None,
         patches: patches(batch),
     };
     CaseInput {
@@ -131,8 +132,8 @@ pub fn write(
 ) -> anyhow::Result<()> {
     bundle.save(weights, Names::Torch, Precision::F32)?;
     let Batch {
-        color_gamma,
-        features_z,
+        color,
+        features,
         reference_hdr,
         ..
     } = &input.batch;
@@ -140,8 +141,8 @@ pub fn write(
         inputs,
         [input.batch.size, input.height, input.width],
         &[
-            ("color_gamma", color_gamma),
-            ("features_z", features_z),
+            ("color_gamma", color),
+            ("features_z", features),
             ("reference_hdr", reference_hdr),
         ],
     )
@@ -194,10 +195,11 @@ pub fn read_input(path: &Path) -> anyhow::Result<CaseInput> {
         batch: Batch {
             size: shape[0],
             patch_size: shape[3],
-            color_gamma: values("color_gamma")?,
-            features_z: values("features_z")?,
+            color: values("color_gamma")?,
+            features: values("features_z")?,
             modulation: None,
             reference_hdr: values("reference_hdr")?,
+            reference_light: None,
             patches: patches(shape[0]),
         },
         height: shape[2],
@@ -229,7 +231,7 @@ mod tests {
         for width in [4, 16, 32] {
             let (network, input) = (network(width), input(1, 64, 64));
             let shape = [1, FEATURES, 64, 64];
-            let features = TensorData::new(input.batch.features_z.clone(), shape);
+            let features = TensorData::new(input.batch.features.clone(), shape);
             let map = network
                 .model
                 .detail_map(Tensor::from_data(features, &device))

@@ -61,8 +61,8 @@ impl Inference {
         };
         Inference {
             model: moved(&bundle.model, device),
-            color_gamma: tensor(input.batch.color_gamma, 3),
-            features_z: tensor(input.batch.features_z, demc_data::FEATURES),
+            color_gamma: tensor(input.batch.color, 3),
+            features_z: tensor(input.batch.features, demc_data::FEATURES),
         }
     }
 

@@ -1,11 +1,11 @@
-//! Arrays of a TOML file that are longer than their type. The parser reads as many values as the type
-//! has and drops the others silently.
+//! Arrays of a TOML file that are longer than their type, or stand for a table. The parser reads as many
+//! values as the type has and drops the others silently.
 
 use serde::Serialize;
 use toml::{Table, Value};
 
-/// The first array of `written` that `read`, the value read from it, holds with fewer values: its key
-/// and both lengths.
+/// The first array of `written` that `read`, the value read from it, holds with fewer values or as a
+/// table: its key, and both lengths.
 ///
 /// # Errors
 /// Such an array.
@@ -26,6 +26,7 @@ fn tables(written: &Table, read: &Table, prefix: &str) -> Result<(), String> {
 fn values(written: &Value, read: &Value, key: &str) -> Result<(), String> {
     match (written, read) {
         (Value::Table(written), Value::Table(read)) => tables(written, read, &format!("{key}.")),
+        (Value::Array(_), Value::Table(_)) => Err(format!("{key} is a table, not a list")),
         (Value::Array(written), Value::Array(read)) if written.len() > read.len() => Err(format!(
             "{key} has {} values instead of {}",
             written.len(),

@@ -138,7 +138,7 @@ impl Dataset {
     /// [`FileError::Read`] without a manifest, [`Error::Dataset`] if it is malformed.
     pub fn list(root: &Path) -> Result<Vec<Scene>, Error> {
         let path = root.join("manifest.json");
-        let text = file::read_text(&path, MAX_MANIFEST)
+        let text = file::read_regular_text(&path, MAX_MANIFEST)
             .map_err(|source| FileError::Read { path, source })?;
         parse(root, &text).map_err(|problem| unusable(root, vec![problem]))
     }

@@ -37,7 +37,7 @@ pub use dataset::{Dataset, Scene, Split};
 pub use error::Error;
 pub use image::exr::{Compression, SamplePrecision, write_rgb};
 pub use image::frame::{FEATURES, Frame, read_frame};
-pub use image::layout::ChannelLayout;
+pub use image::layout::{ChannelLayout, InputKind};
 pub use image::rewrite::{Change, OutputChannels, WriteOptions, Written, write_denoised};
 pub use image::rgb::{Rgb, read_rgb};
 pub use input::position::{PositionMap, PositionSpace};

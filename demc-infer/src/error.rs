@@ -2,6 +2,7 @@
 
 use burn::tensor::TensorReadError;
 use demc_data::image::exr::{UnsupportedSize, check_size};
+use demc_data::input::kpcn::PASS_PLANES;
 use demc_data::{FEATURES, Frame};
 use demc_model::Head;
 use demc_model::config::COLOR_CHANNELS;
@@ -38,6 +39,9 @@ pub enum DenoiseError {
     /// The layers cannot be filtered.
     #[error("{name}")]
     Layers { name: String, source: LayersError },
+    /// A frame without the passes of KPCN.
+    #[error("{name}: no passes, which kpcn needs; read the frame with the model's layout")]
+    NoPasses { name: String },
     /// A feature channel is far from the training data: another unit, or another buffer.
     #[error(
         "{name}: {channel} does not fit the model's statistics: \
@@ -123,7 +127,9 @@ pub(crate) fn check_sizes(frame: &Frame) -> Result<(), DenoiseError> {
         source,
     })?;
     let mask = frame.mask.as_ref().map(|mask| ("mask", mask.len(), 1));
-    for (buffer, found, channels) in checks.into_iter().chain(mask) {
+    let passes = frame.passes.as_ref();
+    let passes = passes.map(|passes| ("passes", passes.len(), PASS_PLANES));
+    for (buffer, found, channels) in checks.into_iter().chain(mask).chain(passes) {
         let expected = channels * width * height;
         if found != expected {
             return Err(DenoiseError::Size {

@@ -1,4 +1,4 @@
-//! The `[model]` table, the variants (Sec. 3, 4.3, 4.4) and the readings of the paper.
+//! The `[model]` table, the variants (Sec. 3, 4.3, 4.4), the readings of the paper, and KPCN.
 //!
 //! All differences between networks are in [`VariantSpec`] and [`ReadingSpec`]. The modules read
 //! these tables and do not branch on names. A new variant is a new row.
@@ -47,6 +47,8 @@ pub enum Variant {
     /// SEMC without features: one encoder for the noisy colour. Ours: a control that measures what
     /// the features contribute.
     ColorOnly,
+    /// The kernel-predicting networks that the paper compares with ([`crate::kpcn`]).
+    Kpcn,
 }
 
 /// The reading of the paper where its text and the authors' released model differ.
@@ -144,8 +146,10 @@ pub struct VariantSpec {
     pub name: &'static str,
     /// The inputs of each encoder, concatenated over channels in this order. The skips enter the
     /// fusion in the order of the encoders (Eq. 2: features, then HDR). The last encoder feeds the
-    /// latent.
+    /// latent. None: the variant is KPCN.
     pub encoders: &'static [&'static [Input]],
+    /// Channels of the colour at input and output: one image, or two for KPCN.
+    pub color_channels: usize,
 }
 
 impl VariantSpec {
@@ -157,9 +161,9 @@ impl VariantSpec {
             .any(|inputs| inputs.contains(&Input::DetailMap))
     }
 
-    /// Whether the features have any effect: whether an encoder takes more than the colour as input.
+    /// Whether the features have any effect: false if encoders take the colour alone as input.
     pub fn takes_features(&self) -> bool {
-        self.encoders.iter().any(|inputs| *inputs != [Input::Color])
+        self.encoders != [[Input::Color]]
     }
 }
 
@@ -181,13 +185,21 @@ pub struct ReadingSpec {
 }
 
 impl Variant {
-    /// All variants in the order of the paper, then the control.
-    pub const ALL: [Variant; 4] = [
+    /// All variants: those of the paper in its order, the control, and KPCN.
+    pub const ALL: [Variant; 5] = [
         Variant::Demc,
         Variant::DemcNosn,
         Variant::Semc,
         Variant::ColorOnly,
+        Variant::Kpcn,
     ];
+
+    /// The variants that have encoders and a decoder: all but KPCN.
+    pub fn with_encoders() -> impl Iterator<Item = Variant> {
+        Self::ALL
+            .into_iter()
+            .filter(|variant| *variant != Variant::Kpcn)
+    }
 
     /// The table of variants.
     pub fn spec(self) -> &'static VariantSpec {
@@ -195,18 +207,27 @@ impl Variant {
             Variant::Demc => &VariantSpec {
                 name: "demc",
                 encoders: &[&[Input::DetailMap], &[Input::Color]],
+                color_channels: COLOR_CHANNELS,
             },
             Variant::DemcNosn => &VariantSpec {
                 name: "demc-nosn",
                 encoders: &[&[Input::Features], &[Input::Color]],
+                color_channels: COLOR_CHANNELS,
             },
             Variant::Semc => &VariantSpec {
                 name: "semc",
                 encoders: &[&[Input::DetailMap, Input::Color]],
+                color_channels: COLOR_CHANNELS,
             },
             Variant::ColorOnly => &VariantSpec {
                 name: "color-only",
                 encoders: &[&[Input::Color]],
+                color_channels: COLOR_CHANNELS,
+            },
+            Variant::Kpcn => &VariantSpec {
+                name: "kpcn",
+                encoders: &[],
+                color_channels: 2 * COLOR_CHANNELS,
             },
         }
     }
@@ -278,6 +299,9 @@ impl Default for ModelConfig {
 impl fmt::Display for ModelConfig {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (variant, reading) = (self.variant.spec().name, self.reading.spec().name);
+        if self.variant == Variant::Kpcn {
+            return write!(f, "{variant}, width {}", self.width);
+        }
         write!(f, "{variant}, {reading} reading, width {}", self.width)?;
         match self.levels {
             LEVEL_WIDTHS => Ok(()),
@@ -314,6 +338,16 @@ impl ModelConfig {
                 "model.levels = {levels:?}: each must be from 1 to {MAX_LEVEL}"
             ));
         }
+        let paper = ModelConfig {
+            variant: self.variant,
+            width: self.width,
+            ..ModelConfig::default()
+        };
+        if self.variant == Variant::Kpcn && *self != paper {
+            problems.push(
+                "model: reading, levels, head, and detail have no meaning for variant kpcn; remove them".into(),
+            );
+        }
         problems
     }
 }
@@ -337,9 +371,9 @@ mod tests {
     #[test]
     fn only_variants_with_a_detail_map_have_a_fusion() {
         let has_fusion = Variant::ALL.map(|variant| variant.spec().has_fusion());
-        assert_eq!(has_fusion, [true, false, true, false]);
+        assert_eq!(has_fusion, [true, false, true, false, false]);
         let takes_features = Variant::ALL.map(|variant| variant.spec().takes_features());
-        assert_eq!(takes_features, [true, true, true, false]);
+        assert_eq!(takes_features, [true, true, true, false, true]);
     }
 
     #[test]
@@ -362,6 +396,19 @@ mod tests {
         };
         let expected = "demc, paper reading, width 3, levels of [3, 6, 6, 12, 3]";
         assert_eq!(narrow.to_string(), expected);
+    }
+
+    #[test]
+    fn keys_of_encoders_are_a_problem_of_kpcn() {
+        let kpcn = ModelConfig {
+            variant: Variant::Kpcn,
+            ..ModelConfig::default()
+        };
+        assert_eq!(kpcn.validate(), Vec::<String>::new());
+        assert_eq!(kpcn.to_string(), "kpcn, width 64");
+        let head = Head::Kernel;
+        let problems = ModelConfig { head, ..kpcn }.validate();
+        assert!(problems.len() == 1 && problems[0].contains("kpcn"));
     }
 
     #[test]

@@ -188,6 +188,15 @@ mod tests {
             ["decoder", "levels", index, ..] => Stage::Decoder {
                 level: LEVELS - 1 - number(index),
             },
+            ["diffuse" | "specular", "layers", "8", ..] => Stage::Head { level: 0 },
+            ["diffuse", "layers", ..] => Stage::Encoder {
+                encoder: 0,
+                level: 0,
+            },
+            ["specular", "layers", ..] => Stage::Encoder {
+                encoder: 1,
+                level: 0,
+            },
             ["decoder", "head", ..] => Stage::Head { level: 0 },
             ["decoder", "kernels", index, ..] => Stage::Head {
                 level: KERNEL_LEVELS - 1 - number(index),

@@ -1,37 +1,38 @@
-//! The whole network (Fig. 3): fusion, encoders, latent, decoder. `forward` holds its forward pass.
+//! A network of any variant. `forward` holds its forward pass.
 
-use burn::module::Module;
+use burn::module::{Module, ModuleVisitor};
 use burn::tensor::Device;
 use rand::Rng;
 
-use crate::config::{LEVELS, ModelConfig, channels_of};
-use crate::decoder::Decoder;
-use crate::encoder::Encoder;
-use crate::fusion::Fusion;
-use crate::init::Init;
-use crate::layers::ConvBlock;
+use crate::config::{ModelConfig, Variant};
+use crate::dual_encoder::DualEncoder;
+use crate::kpcn::Kpcn;
 use crate::ops::{self, Ops};
 use crate::weights::{
-    Builder, Stage, Weight, WeightSpec, Weights, WeightsError, collect, described, random, taken,
+    Builder, Weight, WeightCollector, WeightSpec, Weights, WeightsError, described, random, taken,
 };
 
 /// A denoising network of any variant and reading.
-///
-/// Field names are the keys of weight files: renaming one changes the file format.
 #[derive(Module, Debug)]
 pub struct Denoiser {
-    /// The feature fusion sub-network, if the variant has one.
-    pub fusion: Option<Fusion>,
-    /// The encoders in the order of the table of variants; the last one feeds the latent.
-    pub encoders: Vec<Encoder>,
-    /// The latent representation's convolution.
-    pub latent: ConvBlock,
-    /// The decoder with the skip fusions and the output head.
-    pub decoder: Decoder,
+    /// The network itself.
+    pub body: Body,
     #[module(skip)]
     config: ModelConfig,
     #[module(skip)]
     ops: Ops,
+}
+
+/// The network of a variant.
+///
+/// The names of its fields are the keys of weight files: renaming one changes the file format.
+#[derive(Module, Debug)]
+#[allow(clippy::large_enum_variant, reason = "there is one per process")]
+pub enum Body {
+    /// Encoders and a decoder.
+    DualEncoder(DualEncoder),
+    /// The networks of KPCN.
+    Kpcn(Kpcn),
 }
 
 impl ModelConfig {
@@ -84,29 +85,12 @@ impl Denoiser {
         config: &ModelConfig,
         head_bias: [f32; 3],
     ) -> Result<Self, WeightsError> {
-        let spec = config.variant.spec();
-        let deepest = config.level_channels()[LEVELS - 1];
-        let fusion = if spec.has_fusion() {
-            Some(
-                b.enter(Stage::Fusion)
-                    .part("fusion", |b| Fusion::build(b, config.width, config.detail))?,
-            )
-        } else {
-            None
+        let body = match config.variant {
+            Variant::Kpcn => Body::Kpcn(Kpcn::build(b, config.width)?),
+            _ => Body::DualEncoder(DualEncoder::build(b, config, head_bias)?),
         };
-        let encoders = b.list("encoders", spec.encoders.len(), |b, e| {
-            Encoder::build(b, config, e, channels_of(spec.encoders[e]))
-        })?;
-        let normalised = config.reading.spec().normalised_decoder;
-        let latent = b.enter(Stage::Latent).part("latent", |b| {
-            ConvBlock::build(b, [deepest, deepest], normalised, Init::Zeros)
-        })?;
-        let decoder = b.part("decoder", |b| Decoder::build(b, config, head_bias))?;
         Ok(Denoiser {
-            fusion,
-            encoders,
-            latent,
-            decoder,
+            body,
             config: *config,
             ops: ops::process_default(),
         })
@@ -127,9 +111,33 @@ impl Denoiser {
         Denoiser { ops, ..self }
     }
 
+    /// The encoders and the decoder; `None` for KPCN.
+    pub fn dual_encoder(&self) -> Option<&DualEncoder> {
+        match &self.body {
+            Body::DualEncoder(network) => Some(network),
+            Body::Kpcn(_) => None,
+        }
+    }
+
+    /// Whether the network filters layers of the image, too: whether it has a kernel head.
+    pub fn filters_layers(&self) -> bool {
+        self.dual_encoder()
+            .is_some_and(|network| network.decoder.head.is_none())
+    }
+
+    /// Visits all parameters. Their paths are the names of the weights, without the body's.
+    pub fn visit_named(&self, visitor: &mut impl ModuleVisitor) {
+        match &self.body {
+            Body::DualEncoder(network) => network.visit(visitor),
+            Body::Kpcn(networks) => networks.visit(visitor),
+        }
+    }
+
     /// All weights and running statistics on the host, in the order of the modules.
     pub fn weights(&self) -> Vec<Weight> {
         // Burn merges an update of running statistics only at the next one; `valid` merges it, too.
-        collect(&self.valid())
+        let mut collector = WeightCollector::default();
+        self.valid().visit_named(&mut collector);
+        collector.weights
     }
 }

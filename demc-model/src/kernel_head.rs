@@ -73,7 +73,7 @@ pub(crate) fn forward(
     let decoded = decoded.into_iter().skip(LEVELS - KERNEL_LEVELS);
     let mut out: Option<Maps> = None;
     for ((conv, decoded), image) in kernels.iter().zip(decoded).zip(scales.into_iter().rev()) {
-        let filtered = image.filter5x5(decoded.conv1x1(conv));
+        let filtered = image.filter(decoded.conv1x1(conv));
         out = Some(match out {
             None => filtered,
             Some(coarse) => filtered.blend(coarse),

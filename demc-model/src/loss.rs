@@ -22,6 +22,11 @@ pub struct LossConfig {
     pub smape: f32,
     /// Weight of the mean absolute error in gamma space, the space of the network's output.
     pub l1: f32,
+    /// Weight of the mean absolute error in linear HDR (Bako et al. 2017).
+    pub l1_hdr: f32,
+    /// Share of the steps, at the start, in which each network of KPCN has its own loss instead: the
+    /// mean absolute error in its space (Bako et al. 2017). 0 for other variants.
+    pub separate: f32,
     /// Epsilon of RelMSE (Eq. 5).
     pub relmse_epsilon: f32,
 }
@@ -34,6 +39,8 @@ impl Default for LossConfig {
             dssim: 0.0,
             smape: 0.0,
             l1: 0.0,
+            l1_hdr: 0.0,
+            separate: 0.0,
             relmse_epsilon: LOSS_EPSILON,
         }
     }
@@ -47,6 +54,7 @@ impl LossConfig {
             ("dssim", self.dssim),
             ("smape", self.smape),
             ("l1", self.l1),
+            ("l1_hdr", self.l1_hdr),
         ];
         let mut problems = Vec::new();
         for (key, weight) in weights {
@@ -57,8 +65,13 @@ impl LossConfig {
             }
         }
         if weights.iter().all(|(_, weight)| *weight == 0.0) {
-            problems
-                .push("loss: at least one of relmse, dssim, smape and l1 must be above 0".into());
+            problems.push(
+                "loss: at least one of relmse, dssim, smape, l1 and l1_hdr must be above 0".into(),
+            );
+        }
+        if !(0.0..=1.0).contains(&self.separate) {
+            let share = self.separate;
+            problems.push(format!("loss.separate = {share:?}: must be from 0 to 1"));
         }
         let epsilon = self.relmse_epsilon;
         if !(epsilon.is_finite() && epsilon > 0.0) {
@@ -104,6 +117,9 @@ impl LossConfig {
             }),
             term(self.l1, &|out, reference| {
                 l1(out, gamma_from_hdr(reference, gamma))
+            }),
+            term(self.l1_hdr, &|out, reference| {
+                mean_per_image((hdr_from_gamma(out, gamma) - reference).abs())
             }),
             term(self.dssim, &|out, reference| {
                 dssim(out, gamma_from_hdr(reference, gamma))

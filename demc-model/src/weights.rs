@@ -8,7 +8,7 @@
 
 use std::collections::BTreeMap;
 
-use burn::module::{Module, ModuleVisitor, Param, ParamId, RunningState};
+use burn::module::{ModuleVisitor, Param, ParamId, RunningState};
 use burn::tensor::{Device, Tensor, TensorData};
 use thiserror::Error;
 
@@ -64,7 +64,7 @@ pub enum Stage {
     Fusion,
     /// A level of an encoder.
     Encoder {
-        /// Index in the table of variants.
+        /// Index in the table of variants; for KPCN 0 or 1, the diffuse or the specular network.
         encoder: usize,
         /// Level, 0 to 4.
         level: usize,
@@ -323,34 +323,28 @@ pub(crate) fn described(
     }
 }
 
-/// Every float tensor of a module with its path, in the order of the fields.
-pub(crate) fn collect(module: &impl Module) -> Vec<Weight> {
-    #[derive(Default)]
-    struct WeightCollector {
-        path: Vec<String>,
-        weights: Vec<Weight>,
+/// Collects every float tensor of a module with its path, in the order of the fields.
+#[derive(Default)]
+pub(crate) struct WeightCollector {
+    path: Vec<String>,
+    pub(crate) weights: Vec<Weight>,
+}
+
+impl ModuleVisitor for WeightCollector {
+    fn enter_module(&mut self, name: &str, _container_type: &str) {
+        self.path.push(name.to_string());
     }
 
-    impl ModuleVisitor for WeightCollector {
-        fn enter_module(&mut self, name: &str, _container_type: &str) {
-            self.path.push(name.to_string());
-        }
-
-        fn exit_module(&mut self, _name: &str, _container_type: &str) {
-            self.path.pop();
-        }
-
-        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            let data = param.val().into_data();
-            self.weights.push(Weight {
-                name: self.path.join("."),
-                shape: data.shape().to_vec(),
-                data: data.try_to_vec::<f32>().expect("the network is float32"),
-            });
-        }
+    fn exit_module(&mut self, _name: &str, _container_type: &str) {
+        self.path.pop();
     }
 
-    let mut collector = WeightCollector::default();
-    module.visit(&mut collector);
-    collector.weights
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        let data = param.val().into_data();
+        self.weights.push(Weight {
+            name: self.path.join("."),
+            shape: data.shape().to_vec(),
+            data: data.try_to_vec::<f32>().expect("the network is float32"),
+        });
+    }
 }

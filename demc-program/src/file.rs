@@ -90,8 +90,19 @@ impl FileId {
 /// # Errors
 /// A file that cannot be read, has more bytes, or is not UTF-8.
 pub fn read_text(path: &Path, most: u64) -> io::Result<String> {
+    text_of(File::open(path)?, most)
+}
+
+/// As [`read_text`], for a regular file: opening a FIFO would wait for a writer.
+///
+/// # Errors
+/// As [`read_text`] and [`open_regular`].
+pub fn read_regular_text(path: &Path, most: u64) -> io::Result<String> {
+    text_of(open_regular(path)?, most)
+}
+
+fn text_of(file: File, most: u64) -> io::Result<String> {
     let mut text = String::new();
-    let file = File::open(path)?;
     file.take(most + 1).read_to_string(&mut text)?;
     if text.len() as u64 > most {
         let why = format!("more than {most} bytes, the limit; name another file");

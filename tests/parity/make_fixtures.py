@@ -6,6 +6,7 @@ depend on the machine, and tests measure the error of the Rust side. Tensors hav
 - `inputs.safetensors`: one batch, `color_gamma`, `features_z`, `reference_hdr`.
 - `VARIANT-READING.safetensors` and, with a kernel head, `demc-READING-kernel.safetensors`: `weight/*`, `output_eval` and, in train mode, `output_train`, `loss`, `grad/*`, and
   `adam/*`: weights and running statistics after 5 steps of Adam on the same batch.
+- `kpcn.safetensors`: inputs, `weight/*`, `output`, and for both losses of KPCN the loss and `grad/*`.
 - `blocks.safetensors`: inputs, outputs and gradients of single blocks of `demc-*`, for the loss
   `sum(outputs * probes)`; and the loss function on its own.
 
@@ -21,7 +22,8 @@ import torch
 from safetensors.numpy import save
 from torch import Tensor, nn
 
-from demc.torch import Denoiser, ModelConfig, hdr_from_gamma, rel_mse
+from demc.torch import Denoiser, Kpcn, ModelConfig, hdr_from_gamma, rel_mse
+from demc.torch.kpcn import joined_hdr, separate_loss
 from demc.torch.network import READINGS, VARIANTS
 
 FIXTURES = Path(__file__).parent / "fixtures"
@@ -31,6 +33,7 @@ SEEDS = {  # found by trial, because the checks reject some seeds; 0 where none 
     "demc-paper-kernel": 2,
     "demc-released-kernel": 2,
     "semc-paper": 1,
+    "kpcn": 7,
 }
 STEPS, LEARNING_RATE = 5, 1e-3
 MARGIN = 0.2  # share of the Rust tests' tolerances that float32 rounding may use up
@@ -59,6 +62,7 @@ def main() -> None:
                 if variant == "demc" and head == "grey":
                     blocks |= blocks_of(config, weights)
     write("blocks", blocks)
+    write("kpcn", kpcn(np.random.RandomState(SEEDS["kpcn"])))
 
 
 def write(name: str, tensors: dict[str, Tensor]) -> None:
@@ -228,6 +232,56 @@ def loss_block(random: np.random.RandomState) -> dict[str, Tensor]:
         "loss/loss": loss.reshape(1),
         "loss/grad": output.grad,
     }
+
+
+def kpcn(random: np.random.RandomState) -> dict[str, Tensor]:
+    """The networks of KPCN, with weights above Xavier's, so that kernels differ from each other."""
+    b, h, w = 2, 32, 32
+    batch = {
+        "light": tensor(random.uniform(0, 1.5, (b, 6, h, w))),
+        "features": tensor(random.uniform(0, 1.0, (b, 12, h, w))),
+        "divisor": tensor(random.uniform(0.1, 1.0, (b, 3, h, w))),
+        "reference_light": tensor(random.uniform(0, 1.5, (b, 6, h, w))),
+        "reference_hdr": tensor(random.uniform(0.2, 2, (b, 3, h, w))),
+    }
+    config = ModelConfig("kpcn", width=WIDTH)
+    shapes = {name: tuple(value.shape) for name, value in Kpcn(config).state_dict().items()}
+    weights = {
+        name: tensor(random.uniform(-1, 1, shape) * (0.02 if len(shape) == 1 else 2.4 / np.sqrt(shape[1] * 25)))
+        for name, shape in shapes.items()
+    }
+
+    def results(dtype: torch.dtype) -> dict[str, Tensor]:
+        model = Kpcn(config)
+        model.load_state_dict(weights, strict=True)
+        model.to(dtype)
+        light, features, divisor, reference_light, reference_hdr = (value.to(dtype) for value in batch.values())
+        found = {}
+        for name in ("separate", "joined"):
+            output = model(light, features)
+            joined = (joined_hdr(output, divisor) - reference_hdr).abs().mean()
+            loss = separate_loss(output, reference_light) if name == "separate" else joined
+            model.zero_grad()
+            loss.backward()
+            found |= {"output": output.detach(), f"{name}/loss": loss.detach().reshape(1)}
+            found |= {f"{name}/grad/{key}": p.grad.clone() for key, p in model.named_parameters()}
+        return found
+
+    exact = results(torch.float64)
+    for name, value in exact.items():
+        if "/grad/" in name and not (value.abs().max() > 1e-7 and (value == 0).double().mean() < 0.5):
+            raise RuntimeError(f"kpcn: {name}: largest {value.abs().max():.1e}")
+    shares = {}
+    for name, single in results(torch.float32).items():
+        scale = exact[name].abs()
+        relative = GRADIENT_TOLERANCE if "/grad/" in name else (OUTPUT_TOLERANCE, 0)
+        tolerance = relative[0] * scale.max() + relative[1] * scale
+        shares[name] = ((single.double() - exact[name]).abs() / tolerance).max().item()
+    name = max(shares, key=shares.get)
+    print(f"kpcn: float32 takes {shares[name]:.3f} of a tolerance, in {name}")
+    if shares[name] > MARGIN:
+        raise RuntimeError(f"kpcn: {name}: float32 takes {shares[name]:.2f} of the tolerance")
+    return batch | {f"weight/{key}": value for key, value in weights.items()} | exact
 
 
 if __name__ == "__main__":

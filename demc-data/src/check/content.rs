@@ -97,6 +97,8 @@ mod tests {
             reference: Some(vec![varied(reference); 3]),
             mask: None,
             alpha: None,
+            passes: None,
+            reference_passes: None,
             clamped: 0,
             exposure_scale: 1.0,
         }

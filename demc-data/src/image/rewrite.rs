@@ -8,6 +8,7 @@
 //! is decoded and compressed in small batches of blocks. Besides the colour, this needs memory for
 //! a few blocks per processor, for any image size.
 
+use std::borrow::Cow;
 use std::io::{Read, Seek};
 use std::path::Path;
 
@@ -36,7 +37,11 @@ pub struct Replaced<'a> {
     pub layout: &'a ChannelLayout,
     /// The names of further channels.
     pub layers: &'a [String],
-    /// Their values: colour, and alpha if given, as for [`rewrite`], then a plane for each layer.
+    /// The names of channels that the output has more, beside the colour. If the input has them, they are
+    /// replaced.
+    pub added: &'a [&'a str],
+    /// Their values: colour, and alpha if given, as for [`rewrite`], then a plane for each layer and for
+    /// each added channel.
     pub planes: &'a [f32],
 }
 
@@ -81,6 +86,7 @@ pub fn rewrite<R: Read + Seek>(
     let replaced = Replaced {
         layout,
         layers: &[],
+        added: &[],
         planes: color_hdr,
     };
     rewrite_with_layers(file, &replaced, output, options)
@@ -89,7 +95,8 @@ pub fn rewrite<R: Read + Seek>(
 /// As [`rewrite`], with layers that have other values too.
 ///
 /// # Errors
-/// As [`rewrite`]; for layers as for the colour's channels.
+/// As [`rewrite`]; for layers as for the colour's channels. A file that has some of the added channels,
+/// but not all.
 pub fn rewrite_with_layers<R: Read + Seek>(
     file: &mut ExrFile<R>,
     replaced: &Replaced<'_>,
@@ -97,10 +104,22 @@ pub fn rewrite_with_layers<R: Read + Seek>(
     options: &WriteOptions,
 ) -> Result<Written, Error> {
     let layout = replaced.layout.in_file(file, None)?;
+    let present = |name: &&&str| file.channel(name).is_some();
+    let (layers, added): (Cow<[String]>, _) = match replaced.added.iter().filter(present).count() {
+        0 => (replaced.layers.into(), replaced.added),
+        _ => {
+            let added = replaced.added.iter().map(|name| (*name).to_owned());
+            (
+                replaced.layers.iter().cloned().chain(added).collect(),
+                &[][..],
+            )
+        }
+    };
     let names = ReplacedNames {
         color: &layout.color,
         alpha: layout.alpha.as_deref(),
-        layers: replaced.layers,
+        layers: &layers,
+        added,
     };
     let plan = RewritePlan::new(file, &names, replaced.planes.len(), options)?;
     let clamped = recode(file, &plan, replaced.planes, output)?;

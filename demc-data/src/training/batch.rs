@@ -6,8 +6,9 @@
 use crate::dataset::Scene;
 use crate::error::Error;
 use crate::image::frame::{FEATURES, FramePlanes, TEXTURES};
-use crate::image::layout::ChannelLayout;
+use crate::image::layout::{ChannelLayout, InputKind};
 use crate::image::plane::Plane;
+use crate::input::kpcn::{KpcnInput, LIGHT, light_from_radiance};
 use crate::input::transform::Normalizer;
 use crate::training::augment::{Augment, Variation};
 use crate::training::cache::{AlbedoFilter, CacheUsage, SceneCache};
@@ -23,35 +24,77 @@ pub struct Batch {
     pub size: usize,
     /// Side of a patch in pixels, P.
     pub patch_size: usize,
-    /// Noisy colour `[B, 3, P, P]`, gamma space, divided by the modulation.
-    pub color_gamma: Vec<f32>,
-    /// Features `[B, 12, P, P]`, Z-scored.
-    pub features_z: Vec<f32>,
-    /// Factor on the network's output, `[B, 3, P, P]`, gamma space ([`Normalizer::modulation`]).
+    /// Noisy colour `[B, 3, P, P]`, gamma space, divided by the modulation. For KPCN, both parts of the
+    /// light `[B, 6, P, P]`, as [`KpcnInput::light`].
+    pub color: Vec<f32>,
+    /// Features `[B, 12, P, P]`, Z-scored; for KPCN [`KpcnInput::features`].
+    pub features: Vec<f32>,
+    /// Factor on the network's output, `[B, 3, P, P]`, gamma space ([`Normalizer::modulation`]). For
+    /// KPCN, the factor on diffuse light, [`KpcnInput::divisor`].
     pub modulation: Option<Vec<f32>>,
     /// Reference colour `[B, 3, P, P]`, linear HDR.
     pub reference_hdr: Vec<f32>,
+    /// For KPCN, both parts of the reference `[B, 6, P, P]`, in the network's space.
+    pub reference_light: Option<Vec<f32>>,
     /// Position of each patch, before flips and transposes.
     pub patches: Vec<Patch>,
 }
 
 impl Batch {
     /// `size` flat patches of `side` x `side` pixels, for measurements of time and memory.
-    pub fn grey(size: usize, side: usize) -> Self {
-        let planes = |channels: usize| vec![0.5; size * channels * side * side];
+    pub fn grey(inputs: InputKind, size: usize, side: usize) -> Self {
         let patch = Patch {
             scene: 0,
             y: 0,
             x: 0,
         };
+        let is_kpcn = !inputs.is_demc();
+        let mut batch = Self::zeros(inputs, is_kpcn, vec![patch; size], side);
+        let planes = [
+            &mut batch.color,
+            &mut batch.features,
+            &mut batch.reference_hdr,
+        ];
+        let more = [&mut batch.modulation, &mut batch.reference_light];
+        let all = planes.into_iter().chain(more.into_iter().flatten());
+        all.for_each(|plane| plane.fill(0.5));
+        batch
+    }
+
+    /// A place for each draw, in their order.
+    fn places(&mut self, draws: Vec<PatchDraw>) -> Vec<PatchBuffers<'_>> {
+        let pixels = self.patch_size * self.patch_size;
+        let colors = self.color.len() / self.size;
+        let color = self.color.chunks_exact_mut(colors);
+        let features = self.features.chunks_exact_mut(FEATURES * pixels);
+        let reference = self.reference_hdr.chunks_exact_mut(3 * pixels);
+        let mut modulation = parts(self.modulation.as_mut(), 3 * pixels);
+        let mut reference_light = parts(self.reference_light.as_mut(), LIGHT * pixels);
+        let draws = draws.into_iter().zip(color.zip(features.zip(reference)));
+        draws
+            .map(|(draw, (color, (features, reference)))| PatchBuffers {
+                draw,
+                color,
+                features,
+                reference,
+                modulation: modulation.next(),
+                reference_light: reference_light.next(),
+            })
+            .collect()
+    }
+
+    fn zeros(inputs: InputKind, is_modulated: bool, patches: Vec<Patch>, side: usize) -> Self {
+        let planes = |channels: usize| vec![0.0; patches.len() * channels * side * side];
+        let colors = if inputs.is_demc() { 3 } else { LIGHT };
         Self {
-            size,
+            size: patches.len(),
             patch_size: side,
-            color_gamma: planes(3),
-            features_z: planes(FEATURES),
-            modulation: None,
+            color: planes(colors),
+            features: planes(FEATURES),
+            modulation: is_modulated.then(|| planes(3)),
             reference_hdr: planes(3),
-            patches: vec![patch; size],
+            reference_light: (!inputs.is_demc()).then(|| planes(LIGHT)),
+            patches,
         }
     }
 }
@@ -62,6 +105,7 @@ pub struct PatchSource {
     patches: Vec<Patch>,
     epoch_orders: EpochOrders,
     normalizer: Normalizer,
+    inputs: InputKind,
     patch_size: usize,
     batch_size: usize,
     augment: Augment,
@@ -84,6 +128,14 @@ struct PatchBuffers<'a> {
     features: &'a mut [f32],
     reference: &'a mut [f32],
     modulation: Option<&'a mut [f32]>,
+    reference_light: Option<&'a mut [f32]>,
+}
+
+/// The parts of a buffer that belong to the patches, of `count` values each; none of a missing buffer.
+fn parts(buffer: Option<&mut Vec<f32>>, count: usize) -> impl Iterator<Item = &mut [f32]> {
+    buffer
+        .into_iter()
+        .flat_map(move |all| all.chunks_exact_mut(count))
 }
 
 impl PatchSource {
@@ -112,6 +164,7 @@ impl PatchSource {
         assert!(!scenes.is_empty(), "training needs at least one scene");
         let patches = patches(&scenes, config.patch_size, config.stride)?;
         Ok(Self {
+            inputs: layout.inputs,
             cache: SceneCache::new(
                 scenes,
                 layout,
@@ -162,43 +215,21 @@ impl PatchSource {
     /// As [`SceneCache::get`], for any scene of the batch.
     pub fn batch(&self, n: u64) -> Result<Batch, Error> {
         let draws = self.draws(n);
-        let pixels = self.patch_size * self.patch_size;
-        let mut batch = Batch {
-            size: draws.len(),
-            patch_size: self.patch_size,
-            color_gamma: vec![0.0; draws.len() * 3 * pixels],
-            features_z: vec![0.0; draws.len() * FEATURES * pixels],
-            modulation: self
-                .normalizer
-                .albedo_demodulation_epsilon
-                .map(|_| vec![0.0; draws.len() * 3 * pixels]),
-            reference_hdr: vec![0.0; draws.len() * 3 * pixels],
-            patches: draws.iter().map(|draw| draw.patch).collect(),
-        };
-        let color = batch.color_gamma.chunks_exact_mut(3 * pixels);
-        let features = batch.features_z.chunks_exact_mut(FEATURES * pixels);
-        let reference = batch.reference_hdr.chunks_exact_mut(3 * pixels);
-        let mut modulation = batch
-            .modulation
-            .iter_mut()
-            .flat_map(|all| all.chunks_exact_mut(3 * pixels));
-        let mut places: Vec<PatchBuffers> = draws
-            .into_iter()
-            .zip(color.zip(features.zip(reference)))
-            .map(|(draw, (color, (features, reference)))| PatchBuffers {
-                draw,
-                color,
-                features,
-                reference,
-                modulation: modulation.next(),
-            })
-            .collect();
+        let inputs = self.inputs;
+        let epsilon = self.normalizer.albedo_demodulation_epsilon;
+        let is_modulated = epsilon.is_some() || !inputs.is_demc();
+        let patches = draws.iter().map(|draw| draw.patch).collect();
+        let mut batch = Batch::zeros(inputs, is_modulated, patches, self.patch_size);
+        let mut places = batch.places(draws);
         // Scene by scene: with a cache smaller than the data, each scene is decoded once per batch.
         places.sort_by_key(|place| place.draw.patch.scene);
         for places in places.chunk_by_mut(|a, b| a.draw.patch.scene == b.draw.patch.scene) {
             let planes = self.cache.get(places[0].draw.patch.scene as usize)?;
             for place in places {
-                self.cut(&planes, place);
+                match inputs {
+                    InputKind::Demc => self.cut(&planes, place),
+                    InputKind::Kpcn => self.cut_light(&planes, place),
+                }
             }
         }
         Ok(batch)
@@ -263,6 +294,38 @@ impl PatchSource {
             out.copy_from_slice(modulation);
         }
         self.normalizer.features_z_from_raw(place.features);
+    }
+
+    /// As [`cut`](Self::cut), for KPCN: flips, transposes, and exposures only.
+    fn cut_light(&self, from: &FramePlanes, place: &mut PatchBuffers<'_>) {
+        let (patch, size) = (place.draw.patch, self.patch_size);
+        let variation = place.draw.variation;
+        let scale = variation.exposure * from.exposure_scale;
+        let cut = |planes: &[Plane]| {
+            let mut out = vec![0.0; planes.len() * size * size];
+            cut_planes(planes.iter(), from.width, patch, size, &mut out);
+            variation.turn(&mut out, size);
+            out
+        };
+        let required = "it is read as required";
+        let passes = cut(from.passes.as_ref().expect(required));
+        let input = KpcnInput::new(&passes, &cut(&from.features), scale);
+        place.color.copy_from_slice(&input.light);
+        place.features.copy_from_slice(&input.features);
+        let reference = cut(from.reference.as_ref().expect(required));
+        for (out, radiance) in place.reference.iter_mut().zip(reference) {
+            *out = scale * radiance;
+        }
+        let mut light = cut(from.reference_passes.as_ref().expect(required));
+        light_from_radiance(&mut light, &input.divisor, scale);
+        for (out, planes) in [
+            (&mut place.modulation, &input.divisor),
+            (&mut place.reference_light, &light),
+        ] {
+            out.as_mut()
+                .expect("a batch of KPCN")
+                .copy_from_slice(planes);
+        }
     }
 }
 

@@ -179,6 +179,8 @@ fn filter_albedo(
         reference: None,
         mask: None,
         alpha: None,
+        passes: None,
+        reference_passes: None,
         ..*planes
     };
     let filtered = filter(&frame_of(input, path)?)

@@ -18,18 +18,17 @@ fn noise_changes_colour_and_second_texture_only() {
     let pixels = 64 * 64;
     let same = |a: &[f32], b: &[f32]| a.iter().zip(b).filter(|(a, b)| a == b).count();
     let features = varied
-        .features_z
+        .features
         .chunks(pixels)
-        .zip(plain.features_z.chunks(pixels));
+        .zip(plain.features.chunks(pixels));
     for (plane, (varied, plain)) in features.enumerate() {
         if plane % FEATURES < 9 {
             assert_eq!(varied, plain, "plane {plane}");
         }
     }
-    let share =
-        same(&varied.color_gamma, &plain.color_gamma) as f32 / plain.color_gamma.len() as f32;
+    let share = same(&varied.color, &plain.color) as f32 / plain.color.len() as f32;
     assert!(share < 0.6, "{share} of the colour is what it was");
-    assert_ne!(varied.features_z, plain.features_z);
+    assert_ne!(varied.features, plain.features);
 }
 
 #[test]
@@ -43,8 +42,8 @@ fn augmentation_turns_all_buffers_of_a_patch_alike() {
     let corner = |batch: &Batch, b: usize, y: usize, x: usize| {
         let index = |plane: usize| (plane * 64 + y) * 64 + x;
         (
-            batch.color_gamma[index(b * 3 + 1)],
-            batch.features_z[index(b * FEATURES + 4)],
+            batch.color[index(b * 3 + 1)],
+            batch.features[index(b * FEATURES + 4)],
             batch.reference_hdr[index(b * 3)],
         )
     };
@@ -80,10 +79,10 @@ fn rgb_and_exposure_change_all_their_buffers_alike() {
             values[from..from + count * pixels].to_vec()
         };
         let images = |batch: &Batch| {
-            let textures = [6, 9].map(|first| planes(&batch.features_z, FEATURES, first, 3));
+            let textures = [6, 9].map(|first| planes(&batch.features, FEATURES, first, 3));
             (planes(&batch.reference_hdr, 3, 0, 3), textures)
         };
-        let geometry = |batch: &Batch| planes(&batch.features_z, FEATURES, 0, 6);
+        let geometry = |batch: &Batch| planes(&batch.features, FEATURES, 0, 6);
         assert_eq!(geometry(&plain), geometry(&varied));
         let ((before, textures), (after, varied_textures)) = (images(&plain), images(&varied));
         let sum = |planes: &[f32]| planes.iter().map(|v| f64::from(*v)).sum::<f64>();
@@ -107,7 +106,7 @@ fn rgb_and_exposure_change_all_their_buffers_alike() {
                 assert_eq!(plane, &before[from * pixels..][..pixels]);
             }
         }
-        let gamma = |batch: &Batch, plane: usize| planes(&batch.color_gamma, 3, plane, 1);
+        let gamma = |batch: &Batch, plane: usize| planes(&batch.color, 3, plane, 1);
         for (plane, from) in order.iter().enumerate() {
             for (a, b) in gamma(&plain, *from).iter().zip(gamma(&varied, plane)) {
                 let expected = f64::from(*a) * exposure.powf(1.0 / 2.2);
@@ -127,11 +126,11 @@ fn axis_permutations_are_the_same_for_normals_and_positions() {
         axes: true,
         ..Augment::default()
     });
-    assert_eq!(plain.color_gamma, varied.color_gamma);
+    assert_eq!(plain.color, varied.color);
     assert_eq!(plain.reference_hdr, varied.reference_hdr);
     let pixels = 64 * 64;
     let features = |batch: &Batch| -> Vec<Vec<f32>> {
-        let planes = batch.features_z.chunks(pixels);
+        let planes = batch.features.chunks(pixels);
         planes.map(<[f32]>::to_vec).collect()
     };
     let (before, after) = (features(&plain), features(&varied));

@@ -99,7 +99,7 @@ fn holds_the_pixels_of_its_place(source: &PatchSource) {
         let index = |channels: usize, channel: usize| ((b * channels + channel) * 64 + y) * 64 + x;
         for channel in 0..FEATURES {
             assert_eq!(
-                batch.features_z[index(FEATURES, channel)],
+                batch.features[index(FEATURES, channel)],
                 frame.features[channel * size + pixel]
             );
         }
@@ -110,7 +110,7 @@ fn holds_the_pixels_of_its_place(source: &PatchSource) {
                 reference[channel * size + pixel]
             );
             let gamma = frame.color[channel * size + pixel].powf(1.0 / 2.2);
-            assert_eq!(batch.color_gamma[index(3, channel)], gamma);
+            assert_eq!(batch.color[index(3, channel)], gamma);
         }
     }
 }
@@ -131,10 +131,10 @@ fn a_demodulated_batch_times_its_modulation_is_the_plain_one() {
         .map(|source| source.batch(1).expect("the sample is sound"));
     assert_eq!(plain.modulation, None);
     let modulation = found.modulation.expect("it is on");
-    assert_eq!(modulation.len(), plain.color_gamma.len());
-    let features = found.features_z.chunks_exact(FEATURES * 64 * 64);
+    assert_eq!(modulation.len(), plain.color.len());
+    let features = found.features.chunks_exact(FEATURES * 64 * 64);
     let textures = features.flat_map(|patch| &patch[TEXTURES * 64 * 64..(TEXTURES + 3) * 64 * 64]);
-    let pixels = plain.color_gamma.iter().zip(&found.color_gamma);
+    let pixels = plain.color.iter().zip(&found.color);
     for (((plain, found), factor), texture) in pixels.zip(&modulation).zip(textures) {
         assert!(
             (found * factor - plain).abs() <= 1e-5 * plain,
@@ -142,7 +142,7 @@ fn a_demodulated_batch_times_its_modulation_is_the_plain_one() {
         );
         assert_eq!(*factor, (texture.max(0.0) + 0.07).powf(1.0 / 2.2));
     }
-    assert_eq!(found.features_z, plain.features_z);
+    assert_eq!(found.features, plain.features);
     assert_eq!(found.reference_hdr, plain.reference_hdr);
 }
 
@@ -186,7 +186,7 @@ fn a_filtered_albedo_is_that_of_the_batches() {
     );
     assert_eq!(kept, plain);
     let mut expected = plain;
-    for patch in expected.features_z.chunks_exact_mut(FEATURES * pixels) {
+    for patch in expected.features.chunks_exact_mut(FEATURES * pixels) {
         let albedo = patch[TEXTURES * pixels..][..3 * pixels].iter_mut();
         albedo.for_each(|value| *value /= 2.0);
     }
@@ -345,7 +345,7 @@ fn positions_relative_to_the_image_are_mapped_before_statistics_and_batches() {
     };
     let position = |batch: &Batch| -> Vec<f32> {
         let pixels = batch.patch_size * batch.patch_size;
-        let patches = batch.features_z.chunks_exact(FEATURES * pixels);
+        let patches = batch.features.chunks_exact(FEATURES * pixels);
         let positions = patches.map(|patch| patch[3 * pixels..6 * pixels].to_vec());
         positions.flatten().collect()
     };
@@ -357,7 +357,7 @@ fn positions_relative_to_the_image_are_mapped_before_statistics_and_batches() {
     let mapped = position(&image);
     assert_ne!(position(&scene), mapped);
     assert!(mapped.iter().all(|x| (-5.0..=5.0).contains(x)));
-    assert_eq!(scene.color_gamma, image.color_gamma);
+    assert_eq!(scene.color, image.color);
 
     let spread = |space| {
         let scenes = train_scenes();

@@ -255,6 +255,36 @@ fn index_keeps_the_keys_that_it_does_not_set() {
 }
 
 #[test]
+fn index_keeps_entries_of_other_directories_and_of_other_spellings() {
+    let dir = Dir::new();
+    dir.scene("set/a.exr");
+    dir.scene("set/b.exr");
+    dir.scene("other/c.exr");
+    let absolute = dir.path("set/b.exr");
+    let scene = |name: &str, file: &Path| json!({"name": name, "split": "test", "base": name, "file": file, "width": 4, "height": 3});
+    let scenes = [
+        scene("a", Path::new("./a.exr")),
+        scene("b", &absolute),
+        scene("c", Path::new("../other/c.exr")),
+        scene("gone", Path::new("../other/gone.exr")),
+    ];
+    let old = json!({"format": "demc-exr 1", "scenes": scenes});
+    fs::write(dir.path("set/manifest.json"), old.to_string()).expect("writable");
+    let text = stdout(&["index", &dir.text("set"), "--overwrite"]);
+    assert!(text.contains("in other directories, kept: 1"), "{text}");
+    assert!(text.contains("without a file, dropped: 1"), "{text}");
+    let text = fs::read_to_string(dir.path("set/manifest.json")).expect("a manifest");
+    let manifest: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+    let found = manifest["scenes"].as_array().expect("scenes");
+    let shown = found.iter().map(|scene| [&scene["file"], &scene["split"]]);
+    let expected = ["a.exr", "b.exr", "../other/c.exr"].map(|file| [json!(file), json!("test")]);
+    assert!(
+        shown.eq(expected.iter().map(|[file, split]| [file, split])),
+        "{text}"
+    );
+}
+
+#[test]
 #[cfg(unix)]
 fn index_refuses_broken_links_and_one_file_under_two_names() {
     let dir = Dir::new();

@@ -42,6 +42,7 @@ fn layers_of_any_part_have_other_values_and_everything_else_stays() {
         let replaced = Replaced {
             layout: &layout,
             layers: &layers,
+            added: &[],
             planes: &values,
         };
         rewrite_with_layers(&mut file, &replaced, &output, &options).expect("written");
@@ -83,6 +84,7 @@ fn only_colour_and_layers_stay_on_request_as_float() {
     let replaced = Replaced {
         layout: &layout(),
         layers: &names(&["sun.R"]),
+        added: &[],
         planes: &values,
     };
     rewrite_with_layers(&mut file, &replaced, &output, &options).expect("written");
@@ -93,6 +95,60 @@ fn only_colour_and_layers_stay_on_request_as_float() {
         .collect();
     assert_eq!(kept, ["B", "G", "R", "sun.R"]);
     assert_eq!(after[3].1, Plane::Float(values[3 * PIXELS..].to_vec()));
+}
+
+#[test]
+fn added_channels_stand_among_the_others_and_are_replaced_the_second_time() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let [input, output, again] =
+        ["in.exr", "out.exr", "again.exr"].map(|name| dir.path().join(name));
+    write_file(
+        &input,
+        vec![header(None, SIZE, scene_kinds(), Method::ZIP16)],
+    );
+    let added = ["extra.B", "zz"];
+    let write = |from: &Path, to: &Path, added: &[&str], values: &[f32]| {
+        let mut file = ExrFile::open(from).expect("a file");
+        let replaced = Replaced {
+            layout: &layout(),
+            layers: &[],
+            added,
+            planes: values,
+        };
+        rewrite_with_layers(&mut file, &replaced, to, &WriteOptions::default())
+    };
+    let mut values = color(PIXELS);
+    values.extend((0..2 * PIXELS).map(|i| 0.1 * i as f32));
+    write(&input, &output, &added, &values).expect("written");
+    let (before, after) = (planes(&input), planes(&output));
+    assert_eq!(after.len(), before.len() + 2);
+    assert!(after.is_sorted_by_key(|(channel, _)| channel.name.clone()));
+    let (new, old): (Vec<_>, Vec<_>) = after
+        .into_iter()
+        .partition(|(channel, _)| added.contains(&channel.name.as_str()));
+    for (index, (_, plane)) in new.into_iter().enumerate() {
+        let expected = &values[(3 + index) * PIXELS..][..PIXELS];
+        assert_eq!(plane, Plane::Float(expected.to_vec()));
+    }
+    for ((channel, before), (_, after)) in before.into_iter().zip(old) {
+        let is_color = ["R", "G", "B"].contains(&channel.name.as_str());
+        assert!(is_color || before == after, "{} changed", channel.name);
+    }
+
+    values.iter_mut().for_each(|value| *value += 1.0);
+    write(&output, &again, &added, &values).expect("written");
+    let names = |path| -> Vec<String> {
+        let planes = planes(path).into_iter();
+        planes.map(|(channel, _)| channel.name.clone()).collect()
+    };
+    assert_eq!(names(&again), names(&output));
+    let (_, last) = planes(&again).pop().expect("channels");
+    assert_eq!(last, Plane::Float(values[4 * PIXELS..].to_vec()));
+    let mixed = write(&output, &again, &["zz", "zzz"], &values);
+    assert!(
+        matches!(mixed, Err(Error::MissingChannels { .. })),
+        "{mixed:?}"
+    );
 }
 
 fn refusal(path: &Path, names: &[String]) -> String {

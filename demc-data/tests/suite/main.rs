@@ -10,6 +10,7 @@ mod datasets;
 mod doctor;
 mod fuzz_inputs;
 mod hostile;
+mod kpcn;
 mod layers;
 mod merging;
 mod reading;

@@ -233,7 +233,7 @@ fn parse_header(entry: &str, path: &Path) -> Result<BundleHeader, BundleError> {
             return Err(within("has a filter of its own".into()));
         }
         let filter = parse_network(&entry.to_string(), path, &[], &within)?;
-        match filter.filter_problem(meta.normalizer.position) {
+        match filter.filter_problem(meta.layout.inputs, meta.normalizer.position) {
             Some(problem) => Err(within(problem)),
             None => Ok(filter),
         }
@@ -277,6 +277,10 @@ fn parse_network(
     problems.extend(statistics_problems(&meta));
     let layout = meta.layout.validate().into_iter();
     problems.extend(layout.map(|problem| format!("layout: {problem}")));
+    if meta.layout.inputs != BundleMeta::inputs_of(meta.model.variant) {
+        let variant = meta.model.variant.spec().name;
+        problems.push(format!("layout.inputs: not those of variant {variant}"));
+    }
     if problems.is_empty() {
         Ok(meta)
     } else {

@@ -1,6 +1,6 @@
 //! Everything about a network except its weights.
 
-use demc_data::{ChannelLayout, Normalizer, PositionSpace, Ranges};
+use demc_data::{ChannelLayout, InputKind, Normalizer, PositionSpace, Ranges};
 use demc_model::{ModelConfig, Variant};
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +28,7 @@ pub struct BundleMeta {
 }
 
 impl BundleMeta {
-    /// Metadata in the current [`FORMAT`].
+    /// Metadata in the current [`FORMAT`]. The layout is read for the network of `model`.
     pub fn new(
         model: ModelConfig,
         normalizer: Normalizer,
@@ -39,7 +39,10 @@ impl BundleMeta {
             format: FORMAT,
             model,
             normalizer,
-            layout,
+            layout: ChannelLayout {
+                inputs: Self::inputs_of(model.variant),
+                ..layout
+            },
             step,
             ranges: None,
         }
@@ -53,9 +56,20 @@ impl BundleMeta {
         }
     }
 
-    /// Why this network cannot be the albedo filter of one that takes such positions; `None` if it
-    /// can. Both get the same positions: in ONNX and Python the caller maps them once.
-    pub fn filter_problem(&self, position: PositionSpace) -> Option<String> {
+    /// The planes that a network of a variant takes as input.
+    pub fn inputs_of(variant: Variant) -> InputKind {
+        match variant {
+            Variant::Kpcn => InputKind::Kpcn,
+            _ => InputKind::Demc,
+        }
+    }
+
+    /// Why this network cannot be the albedo filter of one that takes such inputs and positions; `None`
+    /// if it can. Both get the same positions: in ONNX and Python the caller maps them once.
+    pub fn filter_problem(&self, inputs: InputKind, position: PositionSpace) -> Option<String> {
+        if !(inputs.is_demc() && self.layout.inputs.is_demc()) {
+            return Some("kpcn neither has an albedo filter nor is one".into());
+        }
         // The variant without features takes no positions.
         let same = self.normalizer.position == position || self.model.variant == Variant::ColorOnly;
         let name = |space: PositionSpace| match space {

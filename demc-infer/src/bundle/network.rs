@@ -58,7 +58,10 @@ impl Bundle {
             Some(filter) => filter,
             None => Box::new(model),
         };
-        if let Some(detail) = filter.meta.filter_problem(self.meta.normalizer.position) {
+        if let Some(detail) = filter
+            .meta
+            .filter_problem(self.meta.layout.inputs, self.meta.normalizer.position)
+        {
             return Err(BundleError::AlbedoFilter(detail));
         }
         self.albedo_filter = Some(filter);

@@ -1,6 +1,7 @@
 //! A tiny network with random weights and a frame with a pattern, for this crate's tests.
 
 use burn::tensor::Device;
+use demc_data::input::kpcn::PASS_PLANES;
 use demc_data::{ChannelLayout, FEATURES, FeatureStats, Frame, Normalizer, PositionSpace};
 use demc_model::{Head, ModelConfig, Reading, Variant, Weights};
 use rand::RngExt;
@@ -34,7 +35,10 @@ pub(crate) fn kernel_bundle() -> Bundle {
 fn bundle_with(variant: Variant, head: Head) -> Bundle {
     let model = ModelConfig {
         variant,
-        reading: Reading::Released,
+        reading: match variant {
+            Variant::Kpcn => Reading::Paper,
+            _ => Reading::Released,
+        },
         width: 2,
         head,
         ..ModelConfig::default()
@@ -90,5 +94,7 @@ pub(crate) fn frame(width: usize, height: usize) -> Frame {
         let values = 0..channels * width * height;
         values.map(|i| (i * 7919 % 1013) as f32 / 1013.0).collect()
     };
-    Frame::new("pattern", width, height, pattern(3), pattern(FEATURES))
+    let mut frame = Frame::new("pattern", width, height, pattern(3), pattern(FEATURES));
+    frame.passes = Some(pattern(PASS_PLANES));
+    frame
 }

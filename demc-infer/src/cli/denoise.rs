@@ -1,5 +1,6 @@
 //! `demc-infer denoise`: denoises EXR files one after another.
 
+mod records;
 mod work;
 
 use std::ops::ControlFlow;
@@ -8,28 +9,28 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use demc_data::image::exr::ExrFile;
 use demc_data::image::rewrite::Replaced;
-use demc_program::checksum::sha256_of;
+use demc_program::exit::UsageError;
 use demc_program::message;
 use demc_program::output::{Directories, Outputs};
 
 use super::clamped::Clamped;
-use super::exposure::{InputScale, InputScaleFlag, SequenceScales, stops};
+use super::exposure::{InputScaleFlag, SequenceScales, stops};
 use super::filter::FilterFlag;
 use super::flags::{DeviceFlag, EnsembleFlag, LightFlag, ModelFlag, TilingFlags, describe};
 use super::frames::Frames;
-use super::inputs::{Inputs, place};
+use super::inputs::Inputs;
 use super::jobs::{Job, Jobs};
 use super::layers::LayersFlag;
-use super::layouts::{LayoutFlags, Layouts};
+use super::layouts::LayoutFlags;
 use super::output_flags::OutputFlags;
 use super::preview;
 use super::progress::Progress;
 use super::record::Record;
 use super::shard::Shard;
 use super::warnings::Warnings;
+use crate::Bundle;
 use crate::denoise::{DenoiseOptions, DenoiseProgress};
 use crate::guard::{EnergyBias, Warning};
-use crate::{Bundle, Ensemble};
 use work::{Contents, Method, Prepared, Work, cache_bytes, described, far_from_sequence};
 
 /// Denoise OpenEXR images of up to 32768 pixels a side and 134217728 pixels.
@@ -89,6 +90,10 @@ pub struct Arguments {
     /// after it
     #[arg(long, value_name = "I/N", allow_hyphen_values = true)]
     shard: Option<Shard>,
+    /// Also write the detail map of the feature fusion (Fig. 2 e) as channels detail.R, detail.G, detail.B.
+    /// Needs a model of variant demc or semc
+    #[arg(long)]
+    detail_map: bool,
     #[command(flatten)]
     output_flags: OutputFlags,
     /// Also write a preview NAME.png of each output beside it: clip(2^EXPOSURE x, 0, 1)^(1/2.2)
@@ -115,6 +120,9 @@ pub struct Arguments {
     #[command(flatten)]
     device: DeviceFlag,
 }
+
+/// The channels of the detail map.
+const DETAIL: [&str; 3] = ["detail.R", "detail.G", "detail.B"];
 
 impl Arguments {
     pub fn run(self) -> anyhow::Result<()> {
@@ -201,49 +209,13 @@ impl Arguments {
         }
         let bundle = self.model.load_onto(&self.device)?;
         self.layers.check(&bundle, self.ensemble.passes)?;
+        let variant = bundle.meta.model.variant.spec();
+        if self.detail_map && !variant.has_fusion() {
+            let name = variant.name;
+            let problem = format!("--detail-map: a model of variant {name} has no feature fusion");
+            return Err(UsageError(problem).into());
+        }
         Ok(Method::Network(Box::new(bundle)))
-    }
-
-    /// The options that change an output.
-    fn record(&self, method: &Method, layouts: &Layouts) -> anyhow::Result<Record> {
-        let mut record = method.record(&self.model)?;
-        layouts.record(&mut record);
-        self.layers.record(&mut record);
-        self.output_flags.record(&mut record);
-        if self.repair {
-            record.add("--repair", "on");
-        }
-        if let Some(factor) = self.input_scale.choice.factor() {
-            record.add("--input-scale", factor);
-        }
-        if self.ensemble.passes != Ensemble::One {
-            record.add("--ensemble", self.ensemble.passes.count());
-        }
-        if let Some(restore) = self.light.restore_light {
-            record.add("--restore-light", if restore { "on" } else { "off" });
-        }
-        self.tiling.record(&mut record);
-        Ok(record)
-    }
-
-    /// The record of an image: the options, its file, and its sequence, if that decides its factor.
-    fn image_record(
-        &self,
-        options: &Record,
-        input: &Path,
-        scales: &SequenceScales,
-    ) -> anyhow::Result<Record> {
-        let (directory, name) = place(input);
-        let directory = directory.file_name().unwrap_or_default();
-        let name = Path::new(directory).join(name);
-        let name = name.to_string_lossy();
-        let mut record = options.of_image(&name, &sha256_of(input)?);
-        if self.input_scale.choice == InputScale::Auto
-            && let Some(sequence) = scales.sequence(input)
-        {
-            record.add("sequence", sequence);
-        }
-        Ok(record)
     }
 
     /// Denoises one image if its output is due, and writes its preview. Returns the number of negative
@@ -275,6 +247,7 @@ impl Arguments {
                     let replaced = Replaced {
                         layout,
                         layers: &[],
+                        added: &[],
                         planes: &planes,
                     };
                     self.write(work, job, &mut file, &replaced, record)?;
@@ -292,6 +265,11 @@ impl Arguments {
             ));
         }
         if let Some(path) = &job.preview {
+            anyhow::ensure!(
+                self.overwrite || !path.exists() || preview::is_own(path),
+                "{} was written by another program meanwhile; --overwrite replaces it",
+                path.display()
+            );
             preview::write(path, &job.output, layout, self.exposure)?;
         }
         Ok(clamped)
@@ -366,9 +344,16 @@ impl Arguments {
         let repaired_alpha = || frame.alpha.clone().filter(|_| repaired > 0);
         planes.extend(denoised.alpha.or_else(repaired_alpha).into_iter().flatten());
         planes.extend(denoised.layers);
+        let mut added = DETAIL.as_slice();
+        if self.detail_map {
+            planes.extend(bundle.detail_map(&frame)?.into_iter().flatten());
+        } else {
+            added = &[];
+        }
         let replaced = Replaced {
             layout,
             layers: &names,
+            added,
             planes: &planes,
         };
         self.write(work, job, &mut file, &replaced, record)?;

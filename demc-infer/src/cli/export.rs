@@ -134,7 +134,9 @@ impl Arguments {
         }
         if let Some(name) = &self.layout {
             let layout = ChannelLayout::resolve(name);
-            bundle.meta.layout = layout.map_err(|error| UsageError(error.to_string()))?;
+            let layout = layout.map_err(|error| UsageError(error.to_string()))?;
+            let inputs = bundle.meta.layout.inputs;
+            bundle.meta.layout = ChannelLayout { inputs, ..layout };
         }
         let output = printable(&self.output.display().to_string());
         match format {

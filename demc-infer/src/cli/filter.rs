@@ -40,7 +40,7 @@ pub struct FilterFlag {
         value_enum,
         // All options of models.
         conflicts_with_all = [
-            "path", "patterns", "repair", "choice", "passes", "restore_light", "halo", "tile", "memory", "name",
+            "path", "patterns", "detail_map", "repair", "choice", "passes", "restore_light", "halo", "tile", "memory", "name",
             "ops", "isa",
         ]
     )]

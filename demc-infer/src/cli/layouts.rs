@@ -109,7 +109,10 @@ impl Layouts<'_> {
         file: &ExrFile,
         bundle: &Bundle,
     ) -> Result<(ChannelLayout, Option<String>), Error> {
-        self.choose_for(file, &bundle.meta.layout, bundle.missing())
+        let own = &bundle.meta.layout;
+        let (mut layout, choice) = self.choose_for(file, own, bundle.missing())?;
+        layout.inputs = own.inputs;
+        Ok((layout, choice))
     }
 
     /// The layout of a file whose passes a filter needs: without `--layout`, this project's if it fits.
@@ -161,7 +164,10 @@ impl Layouts<'_> {
         Ok(match (&self.given, first) {
             (None, Some(Ok(file))) => self.of(&file, bundle, say)?,
             // Opening the data set names what is wrong with its files.
-            (given, _) => given.as_ref().unwrap_or(&bundle.meta.layout).clone(),
+            (given, _) => ChannelLayout {
+                inputs: bundle.meta.layout.inputs,
+                ..given.as_ref().unwrap_or(&bundle.meta.layout).clone()
+            },
         })
     }
 }

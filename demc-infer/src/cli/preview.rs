@@ -7,7 +7,7 @@ use std::path::Path;
 use demc_data::ChannelLayout;
 use demc_data::image::exr::ExrFile;
 use demc_program::checksum::sha256_of;
-use demc_program::file::FileError;
+use demc_program::file::{FileError, open_regular};
 
 use crate::Picture;
 
@@ -57,7 +57,7 @@ pub fn shown(path: &Path) -> Option<Shown> {
 }
 
 fn opened(path: &Path) -> Option<png::Reader<BufReader<File>>> {
-    let file = BufReader::new(File::open(path).ok()?);
+    let file = BufReader::new(open_regular(path).ok()?);
     png::Decoder::new(file).read_info().ok()
 }
 

@@ -146,7 +146,8 @@ impl<'a> FrameInput<'a> {
     }
 
     /// The denoised alpha: where it varies, the network's image of it, without a kernel head the mean of
-    /// that and the rendered one. `None` for an image without alpha, or where it varies nowhere.
+    /// that and the rendered one. `None` for an image without alpha, where it varies nowhere, and for
+    /// KPCN, which knows no image but the light.
     ///
     /// # Shapes
     /// Returns `[H, W]`, from 0 to 1.
@@ -158,6 +159,9 @@ impl<'a> FrameInput<'a> {
         let Some(alpha) = &self.frame.alpha else {
             return Ok(None);
         };
+        if !self.bundle.meta.layout.inputs.is_demc() {
+            return Ok(None);
+        }
         let varies = varies(alpha, self.frame.height, self.frame.width);
         if !varies.contains(&true) {
             return Ok(None);
@@ -209,21 +213,7 @@ impl<'a> FrameInput<'a> {
         if observer(place(0.0)).is_break() {
             return Err(cancelled(Cancelled));
         }
-        let normalizer = &self.bundle.meta.normalizer;
-        let mut color = self.padding.cut(self.color, rows.clone(), columns.clone());
-        let (modulation, features_z) = self.modulation_and_features(rows, columns);
-        in_pieces(&mut color, modulation.as_deref(), |color, modulation| {
-            color.iter_mut().for_each(|value| *value *= self.scale);
-            normalizer.color_gamma_from_hdr(color, modulation);
-        });
-        let color_gamma = self.tensor::<COLOR_CHANNELS>(color, rows, columns);
         let network = &self.bundle.model;
-        let layers = LayerTile::new(
-            self.layers,
-            modulation.as_deref(),
-            normalizer.gamma,
-            [rows, columns],
-        );
         let (mut pass, passes) = (0, self.ensemble.count() as f64);
         let mut forward = |[color, features]: [Tensor<4>; 2], layers: Option<Tensor<4>>| {
             let share = |share: f64| (f64::from(pass) + share) / passes;
@@ -232,6 +222,23 @@ impl<'a> FrameInput<'a> {
             pass += 1;
             out.map_err(cancelled)
         };
+        if !self.bundle.meta.layout.inputs.is_demc() {
+            return self.light_tile([rows, columns], |inputs| Ok(forward(inputs, None)?.0));
+        }
+        let normalizer = &self.bundle.meta.normalizer;
+        let mut color = self.padding.cut(self.color, rows.clone(), columns.clone());
+        let (modulation, features_z) = self.modulation_and_features(rows, columns);
+        in_pieces(&mut color, modulation.as_deref(), |color, modulation| {
+            color.iter_mut().for_each(|value| *value *= self.scale);
+            normalizer.color_gamma_from_hdr(color, modulation);
+        });
+        let color_gamma = self.tensor::<COLOR_CHANNELS>(color, rows, columns);
+        let layers = LayerTile::new(
+            self.layers,
+            modulation.as_deref(),
+            normalizer.gamma,
+            [rows, columns],
+        );
         let inputs = [color_gamma, features_z];
         let (out, filtered) = if self.layers.is_empty() {
             let forward = |inputs| forward(inputs, None).map(|(out, _)| out);
@@ -300,7 +307,7 @@ impl<'a> FrameInput<'a> {
         self.tensor::<FEATURES>(planes, &rows, &columns)
     }
 
-    fn tensor<const CHANNELS: usize>(
+    pub(super) fn tensor<const CHANNELS: usize>(
         &self,
         planes: Vec<f32>,
         rows: &PixelRange,

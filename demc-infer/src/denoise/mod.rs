@@ -5,6 +5,9 @@ mod albedo;
 #[cfg(test)]
 mod filter_tests;
 mod input;
+mod kpcn;
+#[cfg(test)]
+mod kpcn_tests;
 mod layers;
 #[cfg(test)]
 mod layers_tests;
@@ -18,9 +21,10 @@ use std::ops::ControlFlow;
 
 use burn::module::Module;
 use burn::tensor::Device;
+use demc_data::input::kpcn::PASS_PLANES;
 use demc_data::input::transform::exposure_scale;
-use demc_data::{FEATURES, Frame, Ranges};
-use demc_model::config::COLOR_CHANNELS;
+use demc_data::{FEATURES, Frame, InputKind, Ranges};
+use demc_model::config::{COLOR_CHANNELS, DETAIL_CHANNELS, DOWNSAMPLING};
 
 use crate::ensemble::Ensemble;
 use crate::padding::Padding;
@@ -39,6 +43,9 @@ pub use seams::SeamError;
 /// exposure augmentation of training. On the data set's scenes, a stop within the range changed the
 /// error by up to 25 % in either direction.
 const TOLERANCE: f64 = 2.0;
+
+/// Side of the tiles of a detail map in pixels: with 64 maps, 0.5 GB.
+const DETAIL_TILE: usize = 1024;
 
 /// How a frame is denoised.
 #[derive(Debug, Clone, Default)]
@@ -242,12 +249,15 @@ impl Bundle {
             let output = (planes * size.height * size.width * size_of::<f32>()) as u64;
             Some(self.memory_budget()?.saturating_sub(output))
         });
-        let modulation = match self.meta.normalizer.albedo_demodulation_epsilon {
-            Some(_) => (COLOR_CHANNELS * size_of::<f32>()) as u64,
-            None => 0,
+        let demodulates = self.meta.normalizer.albedo_demodulation_epsilon.is_some();
+        let planes = match self.meta.layout.inputs {
+            InputKind::Kpcn => PASS_PLANES + FEATURES + COLOR_CHANNELS,
+            InputKind::Demc if demodulates => COLOR_CHANNELS,
+            InputKind::Demc => 0,
         };
-        let extra =
-            modulation + ensemble.bytes_per_pixel(COLOR_CHANNELS + FEATURES, COLOR_CHANNELS);
+        let colors = self.meta.model.variant.spec().color_channels;
+        let extra = (planes * size_of::<f32>()) as u64
+            + ensemble.bytes_per_pixel(colors + FEATURES, colors);
         let images = layer_images(layers);
         let need = |height, width| {
             self.pass_bytes_with(images, height, width) + extra * (height * width) as u64
@@ -281,13 +291,27 @@ impl Bundle {
     /// # Errors
     /// As [`denoise`](Self::denoise).
     pub fn detail_map(&self, frame: &Frame) -> Result<Option<Vec<f32>>, DenoiseError> {
+        if !self.model.config().variant.spec().has_fusion() {
+            return Ok(None);
+        }
         let mut input = FrameInput::new(self, frame)?;
         input.filter_albedo(&Tiling::default(), &mut unobserved)?;
-        let (height, width) = (input.padding.padded_height(), input.padding.padded_width());
-        self.model
-            .detail_map(input.features_z(0..height, 0..width))
-            .map(|map| Ok(input.padding.crop(&input.read(map)?)))
-            .transpose()
+        let padding = input.padding;
+        // The four convolutions reach 4 pixels.
+        let tiling = Tiling {
+            halo: DOWNSAMPLING,
+            side: Some(DETAIL_TILE),
+            memory: None,
+        };
+        let padded = (padding.padded_height(), padding.padded_width());
+        let tiles = Tiles::plan(padded, &tiling, |_, _| 0, None).expect("no limit on memory");
+        let mut out = vec![0.0; DETAIL_CHANNELS * frame.height * frame.width];
+        for (rows, columns) in tiles.iter() {
+            let features = input.features_z(rows.read.clone(), columns.read.clone());
+            let map = self.model.detail_map(features).expect("a variant with one");
+            padding.paste(&input.read(map)?, rows, columns, &mut out);
+        }
+        Ok(Some(out))
     }
 
     pub(crate) fn device(&self) -> Device {

@@ -42,6 +42,11 @@ const BANDWIDTHS: [f32; 2] = [0.5, 1.0];
 /// Bandwidth of errors, choices, and the second pass.
 const LAST_BANDWIDTH: f32 = 1.0;
 
+/// Depths from here on are no distances (ours). Mitsuba has 0, Cycles 1e10, others FLT_MAX.
+const FAR: f32 = 1e9;
+/// Larger samples are refused (ours): their squares would be infinite.
+const LARGEST: f32 = 1e15;
+
 /// Memory for each pixel in bytes, beside the buffers (ours, measured).
 const BYTES_PER_PIXEL: u64 = 320;
 
@@ -72,7 +77,7 @@ pub struct Buffers {
 }
 
 /// Why an image cannot be filtered.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 #[allow(missing_docs, reason = "the messages explain the fields")]
 pub enum NforError {
@@ -83,6 +88,9 @@ pub enum NforError {
         found: usize,
         expected: usize,
     },
+    /// A sample whose square is out of range.
+    #[error("{buffer} has a sample of {value:e}; NFOR takes up to {LARGEST:e}")]
+    Large { buffer: &'static str, value: f32 },
     /// Not enough memory.
     #[error("NFOR of {width}x{height} pixels needs {needed} MiB; {available} MiB are available")]
     Memory {
@@ -95,6 +103,21 @@ pub enum NforError {
 
 /// The buffers of a layout that become those of [`Buffers`], in their order.
 const CONTENTS: [&str; 4] = ["color", "normal", "texture1", "depth"];
+
+impl Buffer {
+    /// Sets depths from [`FAR`] on to 0: with them, renderers say that a camera ray hits nothing.
+    fn forget_misses(&mut self) {
+        let Self {
+            halves: [first, second],
+            variance,
+        } = self;
+        for ((first, second), variance) in first.iter_mut().zip(second).zip(variance) {
+            if first.max(*second) >= FAR {
+                (*first, *second, *variance) = (0.0, 0.0, 0.0);
+            }
+        }
+    }
+}
 
 impl Buffers {
     /// Reads the buffers of a file, whose layout names them (`[passes]`).
@@ -112,10 +135,11 @@ impl Buffers {
         } = decode_passes(file, layout, &contents)?;
         let mut buffers = buffers.into_iter();
         let mut next = || buffers.next().expect("one for each content");
-        let [color, normal, albedo, depth] = CONTENTS.map(|_| Buffer {
+        let [color, normal, albedo, mut depth] = CONTENTS.map(|_| Buffer {
             halves: [next(), next()],
             variance: next(),
         });
+        depth.forget_misses();
         Ok(Self {
             width,
             height,
@@ -130,7 +154,7 @@ impl Buffers {
     /// bits.
     ///
     /// # Errors
-    /// A buffer of another size; too little memory.
+    /// A buffer of another size; a sample above 1e15; too little memory.
     pub fn denoise(&self) -> Result<Vec<f32>, NforError> {
         self.check()?;
         let color = self.halves(&self.color);
@@ -175,6 +199,13 @@ impl Buffers {
                         found,
                         expected,
                     });
+                }
+                let largest = samples
+                    .iter()
+                    .copied()
+                    .find(|sample| sample.abs() > LARGEST);
+                if let Some(value) = largest {
+                    return Err(NforError::Large { buffer, value });
                 }
             }
         }

@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use safetensors::SafeTensors;
 
-use super::{Buffer, Buffers, features_again};
+use super::{Buffer, Buffers, NforError, features_again};
 
 const EXPECTED: &[u8] = include_bytes!("../../../tests/nfor/expected.safetensors");
 
@@ -207,4 +207,25 @@ fn a_buffer_of_another_size_is_named() {
     wrong.albedo.variance.pop();
     let error = wrong.denoise().expect_err("a wrong size").to_string();
     assert_eq!(error, "albedo has 5549 samples instead of 5550");
+}
+
+#[test]
+fn depths_of_misses_and_samples_out_of_range_do_not_blacken_the_image() {
+    let mut buffers = scene(|_, _| 0.7);
+    for samples in &mut buffers.depth.halves {
+        samples[..40].fill(1e30);
+    }
+    assert!(matches!(
+        buffers.denoise(),
+        Err(NforError::Large {
+            buffer: "depth",
+            ..
+        })
+    ));
+    buffers.depth.forget_misses();
+    let image = buffers.denoise().expect("in range");
+    assert!(image.iter().all(|sample| (sample - 0.7).abs() < 1e-3));
+    buffers.color.variance[7] = 1e38;
+    let error = buffers.denoise().expect_err("out of range").to_string();
+    assert_eq!(error, "color has a sample of 1e38; NFOR takes up to 1e15");
 }

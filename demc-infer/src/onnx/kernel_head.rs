@@ -1,7 +1,8 @@
 //! The kernel head (`demc_model::kernel_head`) as a graph.
 //!
 //! ONNX has no operation that filters each pixel with its own kernel. A convolution with one-hot
-//! kernels gathers the 25 neighbours of each pixel; their products with the softmax are summed.
+//! kernels gathers the 25 neighbours of each pixel, 441 for KPCN; their products with the softmax are
+//! summed.
 
 use burn::nn::conv::Conv2d;
 use demc_model::config::COLOR_CHANNELS;
@@ -11,6 +12,12 @@ use super::graph::{AttributeValue, GraphBuilder, Value};
 
 /// Side of a kernel, in pixels.
 const SIDE: usize = 5;
+
+/// The one-hot kernels that gather the neighbours of a pixel.
+pub(super) struct Neighbours {
+    side: usize,
+    kernels: Value,
+}
 
 impl GraphBuilder {
     /// The denoised image in gamma space. `decoded` are the decoder's maps, deepest first, and
@@ -27,7 +34,7 @@ impl GraphBuilder {
             let image = scales[level - 1].clone();
             scales.push(self.halved(&format!("kernels.image.{level}"), &image));
         }
-        let neighbours = self.neighbours();
+        let neighbours = self.neighbours(SIDE);
         let decoded = &decoded[decoded.len() - kernels.len()..];
         let mut out: Option<Value> = None;
         for (k, (conv, decoded)) in kernels.iter().zip(decoded).enumerate() {
@@ -35,7 +42,7 @@ impl GraphBuilder {
             let all = self.conv(decoded, conv, None);
             let weights =
                 self.channels(&format!("kernels.weights.{level}"), &all, 0..KERNEL_LOGITS);
-            let filtered = self.filtered(level, &scales[level], &weights, &neighbours);
+            let filtered = self.filtered(&level.to_string(), &scales[level], &weights, &neighbours);
             out = Some(match out {
                 None => filtered,
                 Some(coarse) => {
@@ -56,31 +63,43 @@ impl GraphBuilder {
         self.node("Mul", "output_gamma", &[&power, &factor], &[])
     }
 
-    /// One-hot kernels `[75, 1, 5, 5]`: the 25 neighbours of each channel.
-    fn neighbours(&mut self) -> Value {
-        let mut values = vec![0.0; COLOR_CHANNELS * KERNEL_LOGITS * SIDE * SIDE];
-        for (kernel, values) in values.chunks_mut(SIDE * SIDE).enumerate() {
-            values[kernel % KERNEL_LOGITS] = 1.0;
+    /// One-hot kernels `[3 N, 1, side, side]`: the N neighbours of each channel.
+    pub(super) fn neighbours(&mut self, side: usize) -> Neighbours {
+        let taps = side * side;
+        let mut values = vec![0.0; COLOR_CHANNELS * taps * taps];
+        for (kernel, values) in values.chunks_mut(taps).enumerate() {
+            values[kernel % taps] = 1.0;
         }
-        let shape = [COLOR_CHANNELS * KERNEL_LOGITS, 1, SIDE, SIDE];
-        self.constant("kernels.neighbours", &shape, &values)
+        let shape = [COLOR_CHANNELS * taps, 1, side, side];
+        Neighbours {
+            side,
+            kernels: self.constant("kernels.neighbours", &shape, &values),
+        }
     }
 
-    /// An image `[B, 3, H, W]`, filtered with the softmax of `[B, 25, H, W]`.
-    fn filtered(&mut self, level: usize, image: &Value, weights: &Value, taps: &Value) -> Value {
-        let name = |what: &str| format!("kernels.{what}.{level}");
+    /// An image `[B, 3, H, W]`, filtered with the softmax of `[B, N, H, W]`. Names of values end in `part`.
+    pub(super) fn filtered(
+        &mut self,
+        part: &str,
+        image: &Value,
+        weights: &Value,
+        neighbours: &Neighbours,
+    ) -> Value {
+        let side = neighbours.side;
+        let name = |what: &str| format!("kernels.{what}.{part}");
         let axis = [("axis", AttributeValue::Int(1))];
         let shares = self.node("Softmax", &name("softmax"), &[weights], &axis);
-        let reach = (SIDE / 2) as i64;
+        let reach = (side / 2) as i64;
         let pads = self.integers(&name("pads"), &[0, 0, reach, reach, 0, 0, reach, reach]);
         let edge = [("mode", AttributeValue::Text("edge"))];
         let padded = self.node("Pad", &name("padded"), &[image, &pads], &edge);
         let groups = [
             ("group", AttributeValue::Int(COLOR_CHANNELS as i64)),
-            ("kernel_shape", AttributeValue::Ints(&[SIDE, SIDE])),
+            ("kernel_shape", AttributeValue::Ints(&[side, side])),
         ];
-        let gathered = self.node("Conv", &name("gathered"), &[&padded, taps], &groups);
-        let taps = KERNEL_LOGITS as i64;
+        let inputs = [&padded, &neighbours.kernels];
+        let gathered = self.node("Conv", &name("gathered"), &inputs, &groups);
+        let taps = (side * side) as i64;
         let [colors, one] = [("color_shape", COLOR_CHANNELS as i64), ("weight_shape", 1)]
             .map(|(what, first)| self.integers(&name(what), &[0, first, taps, -1]));
         let values = self.node("Reshape", &name("taps"), &[&gathered, &colors], &[]);

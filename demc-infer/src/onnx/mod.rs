@@ -16,12 +16,17 @@
 //! ignores the second. Inputs, outputs and all computations are float32; [`Precision::F16`] only
 //! affects the stored weights of the convolutions.
 //!
+//! The graph of KPCN is its network alone: `color` `[batch, 6, height, width]`, `features` of 12 channels,
+//! and `output` are those of [`demc_model::kpcn::Kpcn::forward`], and the caller converts
+//! ([`demc_data::input::kpcn`]).
+//!
 //! The operator set is 17 (June 2022). Later ones change no operator used here except for added
 //! types, so a newer set would only exclude older runtimes.
 
 mod albedo;
 mod graph;
 mod kernel_head;
+mod kpcn;
 mod network;
 mod proto;
 
@@ -29,8 +34,9 @@ use std::fs;
 use std::io::Write;
 use std::path::Path;
 
+use demc_data::InputKind;
 use demc_data::image::frame::FEATURE_NAMES;
-use demc_model::config::{COLOR_CHANNELS, FEATURE_CHANNELS};
+use demc_model::config::FEATURE_CHANNELS;
 
 use crate::bundle::Description;
 use crate::{Bundle, BundleError, Precision};
@@ -68,6 +74,55 @@ const DOCUMENTATION: &str = "DEMC, a denoiser for Monte Carlo renderings (Yang e
     Values must be finite. \
     Metadata: `demc` holds model, statistics, channel names and training step as JSON, `demc.features` the \
     order of the features.";
+
+const KPCN_DOCUMENTATION: &str = "KPCN, a denoiser for Monte Carlo renderings (Bako et al. 2017). \
+    color [batch, 6, height, width] is noisy diffuse light / (albedo + 0.00316), and ln(1 + specular light). \
+    features [batch, 12, height, width] are normal xyz, albedo RGB, depth / its largest value in the image, \
+    and the variances of the mean of both parts of color, normal, albedo, and depth, each of the luminance. \
+    output [batch, 6, height, width] is color without noise. \
+    Height and width must be multiples of 32: repeat the last row and column, and crop the output. \
+    Values must be finite. \
+    Metadata: `demc` holds model, statistics, channel names and training step as JSON, `demc.features` the \
+    order of the features.";
+
+const KPCN_FEATURES: [&str; FEATURE_CHANNELS] = [
+    "normal.x",
+    "normal.y",
+    "normal.z",
+    "albedo.r",
+    "albedo.g",
+    "albedo.b",
+    "depth",
+    "variance of diffuse",
+    "variance of specular",
+    "variance of normal",
+    "variance of albedo",
+    "variance of depth",
+];
+
+/// What a file says about its network.
+struct Texts {
+    color: &'static str,
+    features: [&'static str; FEATURE_CHANNELS],
+    documentation: &'static str,
+}
+
+impl Texts {
+    fn of(bundle: &Bundle) -> Self {
+        match bundle.meta.layout.inputs {
+            InputKind::Demc => Self {
+                color: "radiance, linear HDR",
+                features: FEATURE_NAMES,
+                documentation: DOCUMENTATION,
+            },
+            InputKind::Kpcn => Self {
+                color: "diffuse light / albedo, logarithm of specular light",
+                features: KPCN_FEATURES,
+                documentation: KPCN_DOCUMENTATION,
+            },
+        }
+    }
+}
 
 impl Bundle {
     /// Writes the network as an ONNX file atomically, reads it back and compares. In f16 the file
@@ -114,11 +169,14 @@ impl Bundle {
             graph = albedo::with_filter(graph, network(filter), precision);
         }
         graph.name = "demc".into();
+        let texts = Texts::of(&bundle);
+        let colors = bundle.meta.model.variant.spec().color_channels;
+        let features = texts.features.join(", ");
         graph.input = vec![
-            image(COLOR, COLOR_CHANNELS, "Noisy radiance, linear HDR"),
-            image(FEATURES, FEATURE_CHANNELS, &FEATURE_NAMES.join(", ")),
+            image(COLOR, colors, &format!("Noisy {}", texts.color)),
+            image(FEATURES, FEATURE_CHANNELS, &features),
         ];
-        graph.output = vec![image(OUTPUT, COLOR_CHANNELS, "Radiance, linear HDR")];
+        graph.output = vec![image(OUTPUT, colors, texts.color)];
         let json = |text: serde_json::Result<String>| {
             text.map_err(|error| BundleError::Encode(error.to_string()))
         };
@@ -131,7 +189,7 @@ impl Bundle {
             producer_name: "demc".into(),
             producer_version: env!("CARGO_PKG_VERSION").into(),
             model_version: i64::try_from(bundle.meta.step).ok(),
-            doc_string: DOCUMENTATION.into(),
+            doc_string: texts.documentation.into(),
             graph: Some(graph),
             opset_import: vec![OperatorSetIdProto {
                 domain: Some(String::new()),
@@ -142,7 +200,7 @@ impl Bundle {
                     META,
                     json(serde_json::to_string(&Description::of(&bundle)))?,
                 ),
-                entry(FEATURE_ORDER, json(serde_json::to_string(&FEATURE_NAMES))?),
+                entry(FEATURE_ORDER, json(serde_json::to_string(&texts.features))?),
             ],
         })
     }

@@ -1,6 +1,6 @@
 //! Turns the network into a graph by visiting its modules in the order of `Denoiser::forward`.
 //!
-//! Variants and readings differ in the modules and in the table of inputs, so this file has no
+//! The variants with encoders and readings differ in the modules and in the table of inputs, so this file has no
 //! branch on either. Names, shapes and roles of the weights come from
 //! [`weight_specs`](demc_model::ModelConfig::weight_specs).
 
@@ -11,6 +11,8 @@ use demc_data::image::frame::MAX_ALBEDO;
 use demc_data::image::frame::TEXTURES;
 use demc_model::config::{COLOR_CHANNELS, FEATURE_CHANNELS, Input};
 use demc_model::decoder::DecoderLevel;
+use demc_model::denoiser::Body;
+use demc_model::dual_encoder::DualEncoder;
 use demc_model::encoder::EncoderLevel;
 use demc_model::inference::{FoldedConv, norm_scale};
 use demc_model::layers::ConvBlock;
@@ -27,6 +29,13 @@ pub const FEATURES: &str = "features";
 pub const OUTPUT: &str = "output";
 impl GraphBuilder {
     pub(super) fn denoise(&mut self, model: &Denoiser, normalizer: &Normalizer) {
+        match &model.body {
+            Body::DualEncoder(network) => self.dual_encoder(network, normalizer),
+            Body::Kpcn(networks) => self.kpcn(networks),
+        }
+    }
+
+    fn dual_encoder(&mut self, model: &DualEncoder, normalizer: &Normalizer) {
         let features = self.albedo_clamped();
         let modulation = self.modulation(normalizer, &features);
         let color_gamma = self.color_gamma(normalizer.gamma, modulation.as_ref());
@@ -133,7 +142,7 @@ impl GraphBuilder {
         self.relu(&y)
     }
 
-    fn relu(&mut self, x: &Value) -> Value {
+    pub(super) fn relu(&mut self, x: &Value) -> Value {
         self.node("Relu", &format!("{}.relu", x.0), &[x], &[])
     }
 
@@ -173,7 +182,7 @@ impl GraphBuilder {
     }
 
     /// Concatenates values along the channels; a single value stays as it is.
-    fn concat(&mut self, name: &str, parts: &[&Value]) -> Value {
+    pub(super) fn concat(&mut self, name: &str, parts: &[&Value]) -> Value {
         match parts {
             [one] => (*one).clone(),
             _ => self.node("Concat", name, parts, &[("axis", AttributeValue::Int(1))]),

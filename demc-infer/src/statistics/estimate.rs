@@ -74,6 +74,9 @@ impl Scale {
 pub struct Average {
     /// Mean: geometric for errors, of which smaller ones are better.
     pub mean: f64,
+    /// Lower and upper end of its 95 % interval; `None` for fewer than two base scenes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub interval: Option<[f64; 2]>,
     /// Mean of each seed.
     pub of_seeds: Vec<f64>,
 }
@@ -95,8 +98,11 @@ impl Average {
             .of_seeds
             .iter()
             .map(|seed| scale.mean(table.mean + seed));
+        let interval = Bootstrap::new(&table, RESAMPLES)
+            .map(|bootstrap| bootstrap.interval(OUTSIDE).map(|end| scale.mean(end)));
         Some(Self {
             mean: scale.mean(table.mean),
+            interval,
             of_seeds: of_seeds.collect(),
         })
     }
@@ -326,6 +332,8 @@ mod tests {
         assert!((average(Better::Lower).mean - 4.0).abs() < 1e-12);
         assert_eq!(average(Better::Higher).mean, 5.25);
         assert_eq!(average(Better::Higher).of_seeds, [5.25]);
+        let [low, high] = average(Better::Lower).interval.expect("two base scenes");
+        assert!(0.0 < low && low < 4.0 && high > 4.0, "{low} {high}");
     }
 
     #[test]

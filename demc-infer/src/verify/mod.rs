@@ -6,9 +6,10 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
+use burn::tensor::{Device, Tensor, TensorData};
 use demc_data::image::frame::FEATURES;
-use demc_data::{FeatureStats, Frame};
-use demc_model::Head;
+use demc_data::{FeatureStats, Frame, InputKind};
+use demc_model::{Denoiser, Head};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -161,24 +162,16 @@ pub fn verify(
     let folder = tempfile::tempdir()?;
     let mut rng = ChaCha8Rng::seed_from_u64(SEED);
     let mut outputs = Vec::with_capacity(SIZES.len());
-    for (i, [batch, height, width]) in SIZES.into_iter().enumerate() {
-        let (mut colors, mut features, mut output) = (Vec::new(), Vec::new(), Vec::new());
-        for _ in 0..batch {
-            let statistics = &expected.meta.normalizer.features;
-            let frame = synthetic_frame([height, width], statistics, &mut rng);
-            output.extend(match runtime {
-                Runtime::OnnxRuntime => expected.run_graph(&frame)?,
-                Runtime::PyTorch => expected.denoise(&frame)?,
-            });
-            colors.extend(frame.color);
-            features.extend(frame.features);
+    for (i, size) in SIZES.into_iter().enumerate() {
+        let batch = match expected.meta.layout.inputs {
+            InputKind::Demc => SyntheticBatch::of_frames(size, runtime, expected, &mut rng)?,
+            InputKind::Kpcn => SyntheticBatch::of_light(size, &expected.model, &mut rng),
+        };
+        for (kind, values) in [("color", &batch.color), ("features", &batch.features)] {
+            let path = folder.path().join(format!("{i}.{kind}"));
+            fs::write(path, f32_bytes(values))?;
         }
-        fs::write(folder.path().join(format!("{i}.color")), f32_bytes(&colors))?;
-        fs::write(
-            folder.path().join(format!("{i}.features")),
-            f32_bytes(&features),
-        )?;
-        outputs.push(output);
+        outputs.push(batch.output);
     }
     let head = expected.meta.model.head;
     let runtime = run(file, runtime, python, folder.path())?;
@@ -245,6 +238,59 @@ fn run(file: &Path, runtime: Runtime, python: &Path, folder: &Path) -> Result<St
             file: file.into(),
             detail: last_line(&stderr),
         }),
+    }
+}
+
+/// What Python gets, and what it should return.
+struct SyntheticBatch {
+    color: Vec<f32>,
+    features: Vec<f32>,
+    output: Vec<f32>,
+}
+
+impl SyntheticBatch {
+    /// Frames, as rendered.
+    fn of_frames(
+        [batch, height, width]: [usize; 3],
+        runtime: Runtime,
+        expected: &Bundle,
+        rng: &mut impl Rng,
+    ) -> Result<Self, DenoiseError> {
+        let (mut color, mut features, mut output) = (Vec::new(), Vec::new(), Vec::new());
+        for _ in 0..batch {
+            let statistics = &expected.meta.normalizer.features;
+            let frame = synthetic_frame([height, width], statistics, rng);
+            output.extend(match runtime {
+                Runtime::OnnxRuntime => expected.run_graph(&frame)?,
+                Runtime::PyTorch => expected.denoise(&frame)?,
+            });
+            color.extend(frame.color);
+            features.extend(frame.features);
+        }
+        Ok(Self {
+            color,
+            features,
+            output,
+        })
+    }
+
+    /// The inputs of KPCN, evenly distributed.
+    fn of_light([batch, height, width]: [usize; 3], model: &Denoiser, rng: &mut impl Rng) -> Self {
+        let colors = model.config().variant.spec().color_channels;
+        let [color, features] = [colors, FEATURES].map(|channels| -> Vec<f32> {
+            let count = batch * channels * height * width;
+            (0..count).map(|_| rng.random()).collect()
+        });
+        let tensor = |values: &[f32], channels: usize| {
+            let shape = [batch, channels, height, width];
+            Tensor::<4>::from_data(TensorData::new(values.to_vec(), shape), &Device::flex())
+        };
+        let output = model.forward(tensor(&color, colors), tensor(&features, FEATURES));
+        Self {
+            output: output.into_data().try_to_vec().expect("float32"),
+            color,
+            features,
+        }
     }
 }
 

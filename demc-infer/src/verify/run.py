@@ -25,6 +25,8 @@ def torch(file):
 
     bundle = demc.torch.load(file)
     version = f"PyTorch {torch.__version__}"
+    if bundle.model.config.variant == "kpcn":
+        return version, lambda *inputs: bundle.model(*map(torch.from_numpy, inputs)).numpy(force=True)
     return version, lambda color, features: numpy.stack([bundle.denoise(*image) for image in zip(color, features)])
 
 

@@ -229,6 +229,77 @@ fn a_partly_finished_directory_is_resumed() {
 }
 
 #[test]
+fn a_shot_does_not_replace_the_image_of_another_one() {
+    let (run, dir) = (run_directory(), tempfile::tempdir().expect("directory"));
+    let output = dir.path().join("out/");
+    let shots = [
+        ("one", "gen-table-test-1.exr"),
+        ("two", "gen-room-test-1.exr"),
+    ];
+    let inputs = shots.map(|(shot, image)| {
+        let folder = dir.path().join(shot).join("v2/beauty");
+        fs::create_dir_all(&folder).expect("a directory");
+        let input = folder.join("f.exr");
+        fs::copy(sample_image(image), &input).expect("copied");
+        input
+    });
+    denoise(run.path(), &[&inputs[0]], &output).success();
+    let before = fs::read(output.join("f.exr")).expect("an image");
+    let now = fs::File::options()
+        .append(true)
+        .open(&inputs[1])
+        .expect("a file");
+    now.set_modified(std::time::SystemTime::now())
+        .expect("a newer file");
+    let outcome = denoise(run.path(), &[&inputs[1]], &output);
+    assert_eq!(outcome.code, 1, "{}", outcome.stderr);
+    outcome.says("input one/v2/beauty/f.exr instead of two/v2/beauty/f.exr");
+    assert_eq!(fs::read(output.join("f.exr")).expect("an image"), before);
+}
+
+#[test]
+fn the_detail_map_is_written_beside_the_colour() {
+    let (run, out) = (run_directory(), tempfile::tempdir().expect("directory"));
+    let input = sample_image("gen-table-test-1.exr");
+    let output = out.path().join("clean.exr");
+    let list = arguments![
+        "denoise",
+        "--model",
+        run.path(),
+        input,
+        "-o",
+        output,
+        "--detail-map"
+    ];
+    demc_infer(list).success();
+    let bundle = random_bundle();
+    let frame = read_frame(&input, &bundle.meta.layout).expect("frame");
+    let expected = bundle.detail_map(&frame).expect("computed");
+    let names = ["detail.R", "detail.G", "detail.B"];
+    let planes = ExrFile::open(&output)
+        .expect("an EXR")
+        .read(&names)
+        .expect("a map");
+    let found: Vec<f32> = planes.iter().flat_map(Plane::to_f32).collect();
+    assert_eq!(Some(found), expected);
+    let rewritten = read_frame(&output, &bundle.meta.layout).expect("frame");
+    assert_eq!(rewritten.features, frame.features);
+
+    let list = arguments![
+        "denoise",
+        "--filter",
+        "nfor",
+        "--detail-map",
+        input,
+        "-o",
+        output
+    ];
+    let outcome = demc_infer(list);
+    assert_eq!(outcome.code, 2);
+    outcome.says("cannot be used with");
+}
+
+#[test]
 fn a_sequence_is_denoised_frame_by_frame() {
     let (run, dir) = (run_directory(), tempfile::tempdir().expect("directory"));
     for number in [8, 9, 10, 12] {

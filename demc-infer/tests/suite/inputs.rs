@@ -41,6 +41,7 @@ fn changed(
     let replaced = Replaced {
         layout: &layout,
         layers: &layers,
+        added: &[],
         planes: &planes,
     };
     let options = WriteOptions {

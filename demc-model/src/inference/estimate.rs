@@ -6,10 +6,11 @@ use super::encoder::DEEPEST_BANDED;
 use super::full_resolution::UPPER_LEVELS;
 use super::pass::BandPlan;
 use crate::config::{
-    COLOR_CHANNELS, DETAIL_CHANNELS, FEATURE_CHANNELS, Head, Input, LEVELS, ModelConfig,
+    COLOR_CHANNELS, DETAIL_CHANNELS, FEATURE_CHANNELS, Head, Input, LEVELS, ModelConfig, Variant,
     channels_of,
 };
 use crate::kernel_head::{KERNEL_LEVELS, logits};
+use crate::kpcn;
 use crate::ops::Ops;
 
 const VALUE: usize = size_of::<f32>();
@@ -41,6 +42,9 @@ pub fn pass_bytes(
     width: usize,
     layers: usize,
 ) -> u64 {
+    if config.variant == Variant::Kpcn {
+        return kpcn_bytes(config, height * width);
+    }
     if ops.has_fast_inference() {
         return peak_bytes(config, height, width, layers);
     }
@@ -51,6 +55,14 @@ pub fn pass_bytes(
     let largest = maps.fold(config.width * height * width, usize::max);
     let layers = layers * COLOR_CHANNELS * height * width;
     BURN_VALUES * ((largest + layers) * VALUE) as u64
+}
+
+/// Memory in bytes of a pass of KPCN. The logits of a network are whole: at its last convolution there
+/// are also the input of it, the same with a border, and the images.
+fn kpcn_bytes(config: &ModelConfig, pixels: usize) -> u64 {
+    let images = 3 * Variant::Kpcn.spec().color_channels + 3 * FEATURE_CHANNELS;
+    let values = images + 2 * config.width + kpcn::KERNEL_LOGITS;
+    (values * pixels * VALUE) as u64
 }
 
 /// Peak memory in bytes of a pass of the kernels over one image of `height` x `width` pixels, with

@@ -17,7 +17,7 @@ use super::folded::FoldedConv;
 use super::images::host;
 use super::pass::InferencePass;
 use crate::config::COLOR_CHANNELS;
-use crate::denoiser::Denoiser;
+use crate::dual_encoder::DualEncoder;
 use crate::kernel_head::{DARKEST, GAMMA, KERNEL_LEVELS};
 
 pub(super) struct KernelHead {
@@ -38,7 +38,7 @@ impl KernelHead {
     /// `[layers, 3, H, W]`, of a single image.
     pub(super) fn new(
         isa: Isa,
-        model: &Denoiser,
+        model: &DualEncoder,
         grid: Grid,
         color: &FlexTensor,
         layers: Option<Tensor<4>>,

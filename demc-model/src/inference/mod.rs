@@ -37,7 +37,7 @@ use demc_kernels::{Isa, grid, memory};
 
 use crate::config::{COLOR_CHANNELS, LEVELS};
 use crate::decoder::Decoder;
-use crate::denoiser::Denoiser;
+use crate::dual_encoder::DualEncoder;
 use encoder::{DEEPEST_BANDED, folded_block};
 use feature_maps::FeatureMaps;
 use full_resolution::{SkipSources, UPPER_LEVELS};
@@ -51,26 +51,18 @@ pub use folded::{FoldedConv, norm_scale};
 pub use watch::{Cancelled, Observer};
 
 pub(crate) fn forward(
-    model: &Denoiser,
-    color_gamma: Tensor<4>,
-    features_z: Tensor<4>,
+    model: &DualEncoder,
+    images: [Tensor<4>; 2],
     layers: Option<Tensor<4>>,
     observer: &mut Observer,
 ) -> Result<(Tensor<4>, Option<Tensor<4>>), Cancelled> {
-    let plan = BandPlan::new(color_gamma.dims()[3]);
-    forward_with(
-        model,
-        [color_gamma, features_z],
-        layers,
-        Tile::F4,
-        plan,
-        observer,
-    )
+    let plan = BandPlan::new(images[0].dims()[3]);
+    forward_with(model, images, layers, Tile::F4, plan, observer)
 }
 
 /// The same with a given size of tiles and plan.
 fn forward_with(
-    model: &Denoiser,
+    model: &DualEncoder,
     [color_gamma, features_z]: [Tensor<4>; 2],
     layers: Option<Tensor<4>>,
     tile: Tile,

@@ -7,7 +7,7 @@ use super::band::TILE_ROWS;
 use super::feature_maps::FeatureMaps;
 use super::folded::FoldedConv;
 use super::watch::Watch;
-use crate::denoiser::Denoiser;
+use crate::dual_encoder::DualEncoder;
 
 /// Pixels of the full resolution in a band, per thread: enough work for a thread, little enough for
 /// caches.
@@ -50,7 +50,7 @@ pub(super) struct InferencePass<'a> {
     pub(super) isa: Isa,
     pub(super) tile: Tile,
     pub(super) plan: BandPlan,
-    pub(super) model: &'a Denoiser,
+    pub(super) model: &'a DualEncoder,
     pub(super) watch: &'a Watch<'a, 'a>,
 }
 

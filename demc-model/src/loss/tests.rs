@@ -17,12 +17,14 @@ fn host(losses: Tensor<1>) -> Vec<f32> {
     losses.into_data().try_to_vec().unwrap()
 }
 
-const TERMS: [(&str, LossConfig); 3] = {
+const TERMS: [(&str, LossConfig); 4] = {
     let none = LossConfig {
         relmse: 0.0,
         dssim: 0.0,
         smape: 0.0,
         l1: 0.0,
+        l1_hdr: 0.0,
+        separate: 0.0,
         relmse_epsilon: LOSS_EPSILON,
     };
     [
@@ -35,6 +37,13 @@ const TERMS: [(&str, LossConfig); 3] = {
         ),
         ("smape", LossConfig { smape: 1.0, ..none }),
         ("l1", LossConfig { l1: 1.0, ..none }),
+        (
+            "l1_hdr",
+            LossConfig {
+                l1_hdr: 1.0,
+                ..none
+            },
+        ),
     ]
 };
 
@@ -50,6 +59,7 @@ fn plain(term: &str, out_gamma: &[f32], ref_hdr: &[f32]) -> Vec<f64> {
         };
         match term {
             "relmse" => rel_mse_image(&out_hdr, reference),
+            "l1_hdr" => mean(&|_, c, r| (c - r).abs()),
             "smape" => mean(&|_, c, r| (c - r).abs() / (c + r + 0.01)),
             _ => mean(&|y, _, r| (y - r.powf(1.0 / f64::from(2.2f32))).abs()),
         }
@@ -193,7 +203,7 @@ fn weighted_terms_are_added() {
         Tensor::<4>::from_data(TensorData::new(values, shape), &device)
     };
     let loss_of = |loss: LossConfig| host(loss.per_image(Ops::Burn, image(0), image(13), 2.2))[0];
-    let [(_, relmse), (_, smape), (_, l1)] = TERMS;
+    let [(_, relmse), (_, smape), (_, l1), _] = TERMS;
     let mixed = LossConfig {
         relmse: 2.0,
         smape: 3.0,
@@ -214,7 +224,15 @@ fn weighted_terms_are_added() {
 fn keys_are_those_of_the_configuration() {
     let table = serde_json::to_value(LossConfig::default()).unwrap();
     let mut keys: Vec<&String> = table.as_object().expect("a table").keys().collect();
-    let mut expected = ["relmse", "dssim", "smape", "l1", "relmse_epsilon"];
+    let mut expected = [
+        "relmse",
+        "dssim",
+        "smape",
+        "l1",
+        "l1_hdr",
+        "separate",
+        "relmse_epsilon",
+    ];
     keys.sort_unstable();
     expected.sort_unstable();
     assert_eq!(keys, expected);

@@ -5,8 +5,6 @@ use burn::tensor::module::avg_pool2d;
 use burn::tensor::ops::AvgPoolOptions;
 use burn::tensor::{Tensor, activation};
 
-/// Side of a kernel, in pixels.
-const SIDE: usize = 5;
 /// Channels of an image.
 const COLORS: usize = 3;
 
@@ -16,15 +14,16 @@ pub(super) fn halve(x: Tensor<4>) -> Tensor<4> {
 }
 
 /// See [`demc_kernels::filter::forward`]. Several images may share the kernels of one.
-pub(super) fn filter5x5(x: Tensor<4>, logits: Tensor<4>) -> Tensor<4> {
+pub(super) fn filter(x: Tensor<4>, logits: Tensor<4>) -> Tensor<4> {
     let [batch, ..] = x.dims();
     let [_, channels, height, width] = logits.dims();
-    let taps = SIDE * SIDE;
+    let side = channels.isqrt();
+    let taps = side * side;
     let kernels = activation::softmax(logits.clone().narrow(1, 0, taps), 1);
-    let padded = replicated(replicated(x.detach(), 2), 3);
+    let padded = replicated(replicated(x.detach(), 2, side / 2), 3, side / 2);
     let tap = |tap: usize| {
-        let image = padded.clone().narrow(2, tap / SIDE, height);
-        image.narrow(3, tap % SIDE, width) * kernels.clone().narrow(1, tap, 1)
+        let image = padded.clone().narrow(2, tap / side, height);
+        image.narrow(3, tap % side, width) * kernels.clone().narrow(1, tap, 1)
     };
     let filtered = (1..taps).fold(tap(0), |sum, i| sum + tap(i));
     if channels > taps {
@@ -43,12 +42,14 @@ pub(super) fn blend(filtered: Tensor<4>, coarse: Tensor<4>) -> Tensor<4> {
     image + weight * doubled(doubled(correction, 2), 3)
 }
 
-/// The image with its first and last row or column twice more.
-fn replicated(x: Tensor<4>, axis: usize) -> Tensor<4> {
+/// The image with its first and last row or column `count` more times.
+fn replicated(x: Tensor<4>, axis: usize, count: usize) -> Tensor<4> {
     let last = x.dims()[axis] - 1;
-    let [first, end] = [0, last].map(|index| x.clone().narrow(axis, index, 1));
-    let parts = vec![first.clone(), first, x, end.clone(), end];
-    Tensor::cat(parts, axis)
+    let [first, end] = [0, last].map(|index| {
+        let border = x.clone().narrow(axis, index, 1);
+        border.repeat_dim(axis, count)
+    });
+    Tensor::cat(vec![first, x, end], axis)
 }
 
 /// Twice the length along an axis, bilinear with half-pixel centres.

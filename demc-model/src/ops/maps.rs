@@ -74,6 +74,21 @@ impl Maps {
         Maps { tensor, ..self }
     }
 
+    /// A 5x5 convolution with padding 2 and a bias.
+    ///
+    /// # Shapes
+    /// `[B, in, H, W]` to `[B, out, H, W]`.
+    pub fn conv5x5(self, conv: &Conv2d, activation: Activation) -> Self {
+        let tensor = match self.ops {
+            Ops::Kernels => {
+                let (weight, bias) = conv_parameters(conv);
+                kernels::conv5x5(self.tensor, weight, bias, activation)
+            }
+            Ops::Burn => activation.apply(conv.forward(self.tensor)),
+        };
+        Maps { tensor, ..self }
+    }
+
     /// A 4x4 deconvolution with stride 2, padding 1 and a bias: exactly twice the size.
     ///
     /// # Shapes
@@ -150,17 +165,17 @@ impl Maps {
         Maps { tensor, ..self }
     }
 
-    /// An image, filtered with a 5x5 kernel per pixel, the softmax of its logits; the border is
-    /// replicated. A 26th logit becomes a fourth channel, its sigmoid. The image has no gradient.
+    /// An image, filtered with a 5x5 or 21x21 kernel per pixel, the softmax of its logits; the border
+    /// is replicated. One more logit becomes a fourth channel, its sigmoid. The image has no gradient.
     /// Logits of a single image filter all images, without autodiff.
     ///
     /// # Shapes
-    /// `[B, 3, H, W]` and logits `[B, 25, H, W]` or `[B, 26, H, W]` to `[B, 3, H, W]` or
-    /// `[B, 4, H, W]`.
-    pub fn filter5x5(self, logits: Maps) -> Self {
+    /// `[B, 3, H, W]` and logits `[B, L, H, W]`, L = 25 or 441, to `[B, 3, H, W]`; with one more
+    /// logit, to `[B, 4, H, W]`.
+    pub fn filter(self, logits: Maps) -> Self {
         let tensor = match self.ops {
-            Ops::Kernels => kernels::filter5x5(self.tensor, logits.tensor),
-            Ops::Burn => filter::filter5x5(self.tensor, logits.tensor),
+            Ops::Kernels => kernels::filter(self.tensor, logits.tensor),
+            Ops::Burn => filter::filter(self.tensor, logits.tensor),
         };
         Maps { tensor, ..self }
     }

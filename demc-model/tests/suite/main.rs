@@ -3,6 +3,7 @@
 #[path = "../../../tests/alone.rs"]
 mod alone;
 mod inference;
+mod kpcn;
 mod layers;
 mod memory;
 mod network;

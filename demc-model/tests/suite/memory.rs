@@ -4,8 +4,8 @@
 use burn::tensor::{Device, Tensor};
 use demc_kernels::memory::used;
 use demc_model::config::LEVEL_WIDTHS as PAPER;
-use demc_model::inference::peak_bytes;
-use demc_model::{Head, ModelConfig, Reading, Variant};
+use demc_model::inference::pass_bytes;
+use demc_model::{Head, ModelConfig, Ops, Reading, Variant};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -36,6 +36,7 @@ fn check() {
         (Variant::DemcNosn, Reading::Paper, 24, PAPER, [1024, 512], 0),
         (Variant::Demc, Reading::Released, 24, PAPER, [768, 1024], 0),
         (Variant::Semc, Reading::Paper, 32, PAPER, [736, 1280], 0),
+        (Variant::Kpcn, Reading::Paper, 32, PAPER, [256, 512], 0),
         (Variant::Demc, Reading::Paper, 32, PAPER, [1088, 1920], 0),
         (
             Variant::ColorOnly,
@@ -66,9 +67,10 @@ fn check() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let model = config.init(&mut rng, [0.5; 3], &device);
         let [before, _] = used();
+        let colors = variant.spec().color_channels;
         let image = |channels| Tensor::<4>::ones([1, channels, height, columns], &device);
         let out = match layers {
-            0 => model.forward(image(3), image(12)),
+            0 => model.forward(image(colors), image(12)),
             _ => {
                 let shape = [layers, 3, height, columns];
                 let images = Tensor::<4>::ones(shape, &device);
@@ -78,8 +80,11 @@ fn check() {
             }
         };
         let [_, peak] = used();
-        assert_eq!(out.dims(), [1, 3, height, columns]);
-        let (measured, estimate) = (peak - before, peak_bytes(&config, height, columns, layers));
+        assert_eq!(out.dims(), [1, colors, height, columns]);
+        let (measured, estimate) = (
+            peak - before,
+            pass_bytes(Ops::Kernels, &config, height, columns, layers),
+        );
         let ratio = estimate as f64 / measured as f64;
         println!(
             "{config:?} {height}x{columns}, {layers} layers: {} MiB estimated, {} MiB measured",

@@ -98,19 +98,43 @@ fn every_case(check: impl Fn(&str, [usize; 4], usize, Activation)) {
 }
 
 #[test]
-fn convolution_agrees_with_burn() {
+fn convolutions_agree_with_burn() {
     every_case(|what, shape, output, activation| {
-        same(what, |ops| {
-            let mut random = RandomTensors::new();
-            let conv = random.conv([shape[1], output], 3);
-            let op = |mut x: Vec<Maps>| x.remove(0).conv3x3(&conv, activation);
-            let (mut found, gradients) = run(ops, &[shape], &mut random, op);
-            found.push(gradient("weight", &conv.weight, &gradients));
-            let bias = conv.bias.as_ref().expect("a bias");
-            found.push(gradient("bias", bias, &gradients));
-            found
-        });
+        for side in [3, 5] {
+            same(&format!("{side}x{side}, {what}"), |ops| {
+                let mut random = RandomTensors::new();
+                let conv = random.conv([shape[1], output], side);
+                let op = |mut x: Vec<Maps>| match side {
+                    3 => x.remove(0).conv3x3(&conv, activation),
+                    _ => x.remove(0).conv5x5(&conv, activation),
+                };
+                let (mut found, gradients) = run(ops, &[shape], &mut random, op);
+                found.push(gradient("weight", &conv.weight, &gradients));
+                let bias = conv.bias.as_ref().expect("a bias");
+                found.push(gradient("bias", bias, &gradients));
+                found
+            });
+        }
     });
+}
+
+#[test]
+fn filters_agree_with_burn() {
+    for size in SIZES {
+        for batch in BATCHES {
+            for logits in [25, 26, 441] {
+                let shape = [batch, logits, size[0], size[1]];
+                same(&format!("{shape:?}"), |ops| {
+                    let mut random = RandomTensors::new();
+                    let image = random.tensor([batch, 3, size[0], size[1]], &device());
+                    let op = |mut logits: Vec<Maps>| {
+                        Maps::from_nchw(image.clone(), ops).filter(logits.remove(0))
+                    };
+                    run(ops, &[shape], &mut random, op).0
+                });
+            }
+        }
+    }
 }
 
 #[test]

@@ -17,8 +17,8 @@ use super::compute::{ComputeArguments, report_stop};
 /// Train variants with several seeds each and compare them on the test split
 ///
 /// The file names a base configuration, seeds and variants (see configs/ablation.toml). Rerun the
-/// command to resume an ablation: complete runs are not repeated. Writes results.csv, and
-/// ablation.md, .json and .svg, to the directory of the ablation.
+/// command to resume an ablation: complete runs are not repeated. Writes results.csv,
+/// ablation.md, .json and .svg, and bars.svg to the directory of the ablation.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// File of the ablation
@@ -78,7 +78,7 @@ pub fn run(arguments: Arguments, reduce: &Reduce) -> anyhow::Result<u8> {
     }
 }
 
-fn report(comparison: &Comparison, paths: [PathBuf; 3]) {
+fn report(comparison: &Comparison, paths: [PathBuf; 4]) {
     say(format!("\n{}", ablation::markdown(comparison)));
     for path in paths {
         say(printable(&path.display().to_string()));

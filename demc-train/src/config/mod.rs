@@ -17,8 +17,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::path::{Path, PathBuf};
 
-use demc_data::DataConfig;
-use demc_infer::Bundled;
+use demc_data::{Augment, DataConfig, InputKind};
+use demc_infer::{BundleMeta, Bundled};
 use demc_model::kernel_head::GAMMA;
 use demc_model::{Head, LossConfig, ModelConfig, Variant};
 use demc_program::checksum::sha256;
@@ -202,7 +202,47 @@ impl Config {
                 self.data.gamma
             ));
         }
+        if self.model.variant == Variant::Kpcn {
+            problems.extend(self.kpcn_problems());
+        } else if self.loss.separate != 0.0 {
+            let share = self.loss.separate;
+            problems.push(format!(
+                "loss.separate = {share:?}: must be 0, except for model.variant = \"kpcn\""
+            ));
+        }
         problems
+    }
+
+    /// What the network takes as input.
+    pub fn inputs(&self) -> InputKind {
+        BundleMeta::inputs_of(self.model.variant)
+    }
+
+    /// Keys with another value than KPCN's.
+    fn kpcn_problems(&self) -> Vec<String> {
+        let data = &self.data;
+        let allowed = Augment {
+            flip: data.augment.flip,
+            transpose: data.augment.transpose,
+            crop: data.augment.crop,
+            exposure: data.augment.exposure,
+            ..Augment::default()
+        };
+        let absent = "must be absent for model.variant = \"kpcn\"";
+        let checks = [
+            (
+                data.augment == allowed,
+                "data.augment: of `rgb`, `axes`, and `noise`, each",
+            ),
+            (data.dropout.is_off(), "data.dropout"),
+            (
+                data.albedo_demodulation_epsilon.is_none(),
+                "data.albedo_demodulation_epsilon",
+            ),
+            (data.position.is_scene(), "data.position"),
+        ];
+        let broken = checks.iter().filter(|(holds, _)| !holds);
+        broken.map(|(_, key)| format!("{key} {absent}")).collect()
     }
 
     /// The configuration as TOML.
@@ -243,12 +283,13 @@ impl Config {
     }
 
     /// The first 16 digits of the SHA-256 of the keys that change numbers of the run (see
-    /// [`differences`](Self::differences)) and of the checksums of the scenes by name.
-    pub fn hash(&self, scenes: &BTreeMap<String, String>) -> String {
+    /// [`differences`](Self::differences)) and of `data`, the text of the
+    /// [contents](crate::run::data::DataContents) of the data set.
+    pub fn hash(&self, data: &str) -> String {
         let keys = self.relevant();
         let keys = keys.iter().map(|(key, value)| format!("{key} = {value}\n"));
-        let files = scenes.iter().map(|(name, sum)| format!("{sum}  {name}\n"));
-        let mut digits = sha256([keys.chain(files).collect::<String>().as_bytes()]);
+        let text = keys.collect::<String>() + data;
+        let mut digits = sha256([text.as_bytes()]);
         digits.truncate(HASH_DIGITS);
         digits
     }

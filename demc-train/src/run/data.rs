@@ -58,12 +58,37 @@ fn checksums<'a>(
         .collect()
 }
 
-/// The SHA-256 of each scene's file in a data set, by the scene's name.
-///
-/// # Errors
-/// A manifest or a file that cannot be read.
-pub fn file_checksums(root: &Path) -> Result<BTreeMap<String, String>, demc_data::Error> {
-    checksums(Dataset::list(root)?.iter())
+/// What a data set contains.
+pub struct DataContents {
+    /// The SHA-256 of each scene's file, by the scene's name.
+    pub checksums: BTreeMap<String, String>,
+    /// A line for each scene in the manifest's order: what a run's numbers depend on.
+    pub text: String,
+}
+
+impl DataContents {
+    /// The contents of the data set in `root`.
+    ///
+    /// # Errors
+    /// A manifest or a file that cannot be read.
+    pub fn of(root: &Path) -> Result<Self, demc_data::Error> {
+        let scenes = Dataset::list(root)?;
+        let checksums = checksums(scenes.iter())?;
+        let lines = scenes.iter().map(|scene| {
+            let Scene {
+                name,
+                split,
+                base,
+                repeat,
+                ..
+            } = scene;
+            format!("{}  {name}  {split}  {base}  {repeat}\n", checksums[name])
+        });
+        Ok(Self {
+            text: lines.collect(),
+            checksums,
+        })
+    }
 }
 
 /// A warning for each group of scenes with equal files.
@@ -133,8 +158,11 @@ impl TrainingData {
             ..
         } = &config.data;
         let mut layout = ChannelLayout::resolve(layout)?;
-        // No network of this program reads them, so weights and run records do not name them.
-        layout.passes = Passes::default();
+        layout.inputs = config.inputs();
+        if layout.inputs.is_demc() {
+            // The network does not read them, so weights and run records do not name them.
+            layout.passes = Passes::default();
+        }
         let dataset = Dataset::open(root, &layout)?;
         let (train, validation) = dataset.train_validation(*validation, config.train.seed)?;
         let test: Vec<Scene> = dataset

@@ -74,7 +74,7 @@ impl DurationEstimate {
             started.elapsed().as_secs_f64()
         };
         let mut time = |batches: usize, patches: usize| {
-            let batch = Batch::grey(patches, config.data.patch_size);
+            let batch = Batch::grey(config.inputs(), patches, config.data.patch_size);
             let (mut least, mut spent, mut times) = (f64::INFINITY, 0.0, 0);
             while times < 2 && spent < LONG_STEP || times < REPETITIONS && spent < TIME_LIMIT {
                 let time = time_step(batches, &batch);

@@ -137,7 +137,11 @@ pub fn read_init(config: &Config) -> anyhow::Result<Option<BundleFile>> {
         differences.join("; ")
     );
     let filter = file.albedo_filter.as_deref();
-    let problem = filter.and_then(|filter| filter.meta.filter_problem(config.data.position));
+    let problem = filter.and_then(|filter| {
+        filter
+            .meta
+            .filter_problem(config.inputs(), config.data.position)
+    });
     if let Some(problem) = problem {
         bail!("train.init: {}: {problem}", init.display());
     }

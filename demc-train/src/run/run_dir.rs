@@ -29,6 +29,8 @@ use crate::run::run_record::{CONFIG, LAYOUT, OWN_FILES, RUN, RecordedSetup, RunR
 
 /// Locked by the training process.
 const LOCK: &str = "lock";
+/// The directory of the pictures of validations and of the test split.
+const STRIPS: &str = "strips";
 /// Scores of the test split.
 pub const SCORES: &str = "test.json";
 /// Files that show that a directory contains a run.
@@ -40,7 +42,14 @@ pub fn replaced_files(dir: &Path) -> Vec<PathBuf> {
     if !dir.join(CONFIG).exists() {
         names.push(LAYOUT);
     }
-    names.into_iter().map(|name| dir.join(name)).collect()
+    let strips = fs::read_dir(dir.join(STRIPS)).into_iter().flatten();
+    let mut files: Vec<PathBuf> = names.into_iter().map(|name| dir.join(name)).collect();
+    for strip in strips.flatten().map(|entry| entry.path()) {
+        if !files.contains(&strip) {
+            files.push(strip);
+        }
+    }
+    files
 }
 
 /// The directory of a run.
@@ -79,7 +88,15 @@ impl RunDir {
             }
             return Ok(dir);
         };
-        if let Some(saved) = dir.saved_config()? {
+        let saved = dir.saved_config()?;
+        if resume && saved.is_none() {
+            bail!(
+                "{}: has {trace}, but neither {CONFIG} nor a checkpoint of a run; move the file, or name another \
+                 directory with --run-dir",
+                path.display()
+            );
+        }
+        if let Some(saved) = saved {
             let differences = config.differences(&saved);
             ensure!(
                 differences.is_empty(),
@@ -147,7 +164,7 @@ impl RunDir {
     pub fn lock_if_present(&mut self) -> anyhow::Result<()> {
         if self.path.is_dir() {
             self.lock()?;
-            for dir in [self.path.clone(), self.path.join("strips")] {
+            for dir in [self.path.clone(), self.path.join(STRIPS)] {
                 remove_abandoned(&dir, None);
             }
         }

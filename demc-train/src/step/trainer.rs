@@ -5,7 +5,7 @@ use burn::module::Module;
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_data::{Batch, FEATURES, Patch, Scene};
-use demc_model::{Denoiser, LossConfig};
+use demc_model::{Denoiser, LossConfig, kpcn};
 use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
@@ -27,6 +27,8 @@ pub struct Trainer {
     ema: Option<Ema>,
     device: Device,
     loss: LossConfig,
+    /// Steps of the run.
+    steps: u64,
     /// Batches per step.
     grad_accumulation: usize,
     max_grad_norm: Option<f32>,
@@ -124,6 +126,7 @@ impl Trainer {
             ema,
             device,
             loss: config.loss,
+            steps: config.train.steps,
             grad_accumulation: config.train.grad_accumulation,
             max_grad_norm: config.optimizer.max_grad_norm,
             gamma: config.data.gamma,
@@ -295,6 +298,11 @@ impl Trainer {
         self.model = Some(model);
     }
 
+    /// Whether each network of KPCN has its own loss now.
+    fn trains_separately(&self) -> bool {
+        (self.optimizer.steps() as f64) < f64::from(self.loss.separate) * self.steps as f64
+    }
+
     /// The loss of each patch of a batch.
     ///
     /// # Shapes
@@ -305,13 +313,20 @@ impl Trainer {
             let data = TensorData::new(values, [size, channels, side, side]);
             Tensor::<4>::from_data(data, &self.device)
         };
-        let color_gamma = tensor(batch.color_gamma, 3);
-        let features_z = tensor(batch.features_z, FEATURES);
+        let model = self.model();
+        let colors = model.config().variant.spec().color_channels;
+        let color = tensor(batch.color, colors);
+        let features = tensor(batch.features, FEATURES);
         let ref_hdr = tensor(batch.reference_hdr, 3);
-        let out_gamma = self.model().forward(color_gamma, features_z);
-        let out_gamma = match batch.modulation {
-            Some(modulation) => out_gamma * tensor(modulation, 3),
-            None => out_gamma,
+        let out = model.forward(color, features);
+        let modulation = batch.modulation.map(|modulation| tensor(modulation, 3));
+        let out_gamma = match (batch.reference_light, modulation) {
+            (Some(light), _) if self.trains_separately() => {
+                return kpcn::separate_losses(out, tensor(light, colors));
+            }
+            (Some(_), Some(divisor)) => kpcn::joined_gamma(out, divisor, self.gamma),
+            (_, Some(modulation)) => out * modulation,
+            (_, None) => out,
         };
         self.loss
             .per_image(self.model().ops(), out_gamma, ref_hdr, self.gamma)

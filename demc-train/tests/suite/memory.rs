@@ -32,6 +32,7 @@ fn check() {
         (Variant::Demc, Reading::Paper, 16, 8, 128),
         (Variant::Demc, Reading::Released, 16, 12, 128),
         (Variant::Demc, Reading::Paper, 32, 12, 128),
+        (Variant::Kpcn, Reading::Paper, 32, 4, 128),
     ];
     for (variant, reading, width, patches, side) in cases {
         let mut config = Config::parse("tiny.toml".as_ref(), "[data]\nroot = \"x\"", &[])
@@ -50,7 +51,7 @@ fn check() {
             None,
             device.clone(),
         );
-        let batch = Batch::grey(patches, side);
+        let batch = Batch::grey(config.inputs(), patches, side);
         for _ in 0..2 {
             trainer
                 .step(1e-4, || Ok::<_, Infallible>(batch.clone()))

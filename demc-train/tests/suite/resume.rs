@@ -66,7 +66,7 @@ fn a_directory_with_another_run_is_refused() {
 #[test]
 fn a_file_that_belongs_to_no_run_is_kept() {
     let (_dir, config, run) = place();
-    for name in ["best.safetensors", "test.json", "strips/test.png"] {
+    for name in ["best.safetensors", "test.json", "strips/step-00000009.png"] {
         let path = run.join(name);
         fs::create_dir_all(path.parent().expect("a directory")).expect("a directory");
         fs::write(&path, "mine").expect("written");
@@ -79,6 +79,29 @@ fn a_file_that_belongs_to_no_run_is_kept() {
         fs::remove_file(&path).expect("removed");
     }
     trained(&config, &run, &["--set=train.steps=1"]);
+}
+
+#[test]
+fn a_resume_keeps_files_of_another_program() {
+    let (_dir, config, run) = place();
+    fs::create_dir_all(&run).expect("a directory");
+    let theirs = [
+        ("metrics.jsonl", "{\"loss\": 1}\n"),
+        ("config.toml", "title = \"x\"\n"),
+    ];
+    for count in [1, 2] {
+        for (name, text) in &theirs[..count] {
+            fs::write(run.join(name), text).expect("written");
+        }
+        let error = error_line(&train(&config, &run, &["--resume"]), 1);
+        assert!(
+            error.contains("neither config.toml nor a checkpoint"),
+            "{error}"
+        );
+        for (name, text) in &theirs[..count] {
+            assert_eq!(fs::read_to_string(run.join(name)).expect("kept"), *text);
+        }
+    }
 }
 
 #[test]

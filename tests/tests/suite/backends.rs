@@ -108,7 +108,7 @@ fn run(backend: &Backend, variant: Variant, reading: Reading) -> BTreeMap<String
 #[test]
 fn all_backends_agree() {
     let backends = backends();
-    for variant in Variant::ALL {
+    for variant in Variant::with_encoders() {
         for reading in Reading::ALL {
             let expected = run(&backends[0], variant, reading);
             for backend in &backends[1..] {

@@ -125,7 +125,10 @@ pub fn gradients_by_name(
 
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
             if let Some(gradient) = self.gradients.get::<D>(param.id) {
-                self.found.insert(self.path.join("."), host(gradient));
+                // The names of weights leave out a network's body.
+                let body = if self.path[0] == "body" { 2 } else { 0 };
+                self.found
+                    .insert(self.path[body..].join("."), host(gradient));
             }
         }
     }

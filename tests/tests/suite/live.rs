@@ -147,6 +147,21 @@ pub fn random_bundle(
     Bundle::new(BundleMeta::new(config, normalizer, layout, 0), model)
 }
 
+/// The networks of KPCN with random weights.
+pub fn random_kpcn(rng: &mut ChaCha8Rng) -> Bundle {
+    let random = random_bundle(Variant::DemcNosn, Reading::Released, 0.0..0.1, rng);
+    let model = ModelConfig {
+        variant: Variant::Kpcn,
+        width: WIDTH,
+        ..ModelConfig::default()
+    };
+    let network = model.init(rng, [0.0; 3], &Device::flex());
+    let BundleMeta {
+        normalizer, layout, ..
+    } = random.meta;
+    Bundle::new(BundleMeta::new(model, normalizer, layout, 0), network)
+}
+
 /// Random values.
 pub fn uniform(low: f32, high: f32, count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
     (0..count).map(|_| rng.random_range(low..high)).collect()

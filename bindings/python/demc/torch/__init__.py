@@ -11,11 +11,13 @@ if TYPE_CHECKING:
     from .bundle import Bundle, load
     from .exr import Frame, read_exr
     from .metrics import gamma_from_hdr, hdr_from_gamma, rel_mse
+    from .kpcn import Kpcn
     from .network import Denoiser, ModelConfig
 
 _MODULES = {
     "bundle": ["Bundle", "load"],
     "exr": ["Frame", "read_exr"],
+    "kpcn": ["Kpcn"],
     "layouts": [],
     "light": [],
     "metrics": ["gamma_from_hdr", "hdr_from_gamma", "rel_mse"],
@@ -27,6 +29,7 @@ __all__ = [
     "Bundle",
     "Denoiser",
     "Frame",
+    "Kpcn",
     "ModelConfig",
     "gamma_from_hdr",
     "hdr_from_gamma",

@@ -1,7 +1,8 @@
 """Describe an exported bundle, and run its network on INPUT if given.
 
 INPUT is a safetensors file with the network's inputs: `color_gamma` [B, 3, H, W] and
-`features_z` [B, 12, H, W]. OUTPUT will contain `output` [B, 3, H, W], in gamma space.
+`features_z` [B, 12, H, W]. OUTPUT will contain `output` [B, 3, H, W], in gamma space. KPCN takes
+light [B, 6, H, W] as `color_gamma`, and so its output is.
 """
 
 import argparse

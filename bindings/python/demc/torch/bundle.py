@@ -23,7 +23,8 @@ from torch.nn import functional as F
 
 from . import light, preprocess
 from .metrics import gamma_from_hdr, hdr_from_gamma
-from .network import Denoiser, ModelConfig
+from .kpcn import Kpcn
+from .network import KPCN, Denoiser, ModelConfig
 from .preprocess import FEATURES, layer_color
 
 FORMAT = 1
@@ -46,7 +47,7 @@ TORCH_FROM_BURN = {"gamma": "weight", "beta": "bias"}
 class Bundle:
     """A network in eval mode and the statistics of its training set."""
 
-    model: Denoiser
+    model: Denoiser | Kpcn
     gamma: float
     feature_mean: Tensor  # [12]
     feature_std: Tensor  # [12]
@@ -104,6 +105,8 @@ class Bundle:
 
     def _inputs(self, color: Tensor, features: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """The network's inputs for prepared colour and features, and the modulation of its output."""
+        if isinstance(self.model, Kpcn):
+            raise ValueError("kpcn takes diffuse and specular light: call `model` with them, or use demc-infer")
         features = self.with_filtered_albedo(features)
         modulation = self.modulation(features)
         color_gamma = gamma_from_hdr(color, self.gamma) / modulation
@@ -257,7 +260,8 @@ def _network(path: str | os.PathLike, meta: Any, weights: dict[str, Tensor], *pa
     gamma, step = entry("normalizer", "gamma"), entry("step")
     demodulate = meta["normalizer"].get("demodulate", 0.0)
     mean, std = (torch.tensor(entry("normalizer", "features", key)) for key in ("mean", "std"))
-    model = Denoiser(ModelConfig(**entry("model")))
+    config = ModelConfig(**entry("model"))
+    model = Kpcn(config) if config.variant == KPCN else Denoiser(config)
     try:
         model.load_state_dict(weights, strict=True)
     except RuntimeError as error:

@@ -10,6 +10,7 @@ figure numbers are the paper's.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Sequence
 
@@ -56,6 +57,8 @@ VARIANTS = {
     "semc": Variant(fusion=True, encoders=(("detail", "color"),)),  # Sec. 4.4, Fig. 4
     "color-only": Variant(fusion=False, encoders=(("color",),)),  # ours: a control
 }
+KPCN = "kpcn"
+"""The variant without encoders (`kpcn.Kpcn`)."""
 CHANNELS = {"detail": 3, "color": 3, "features": FEATURES}
 
 
@@ -92,7 +95,7 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         for what, value, known in (
-            ("variant", self.variant, VARIANTS),
+            ("variant", self.variant, (*VARIANTS, KPCN)),
             ("reading", self.reading, READINGS),
             ("head", self.head, ("grey", "xavier", "kernel")),
             ("detail", self.detail, ("open", "xavier")),
@@ -112,6 +115,8 @@ class ModelConfig:
 
     def __str__(self) -> str:
         """A short name; includes the levels if they are not the paper's."""
+        if self.variant == KPCN:
+            return f"{self.variant}, width {self.width}"
         levels = "" if self.levels == LEVEL_FACTORS else f", levels of {self.level_channels}"
         return f"{self.variant}, {self.reading} reading, width {self.width}{levels}"
 
@@ -301,21 +306,22 @@ def kernel_head(
         images.append(F.avg_pool2d(images[-1], 2))
     out = None
     for level_logits, image in zip(logits, reversed(images)):
-        filtered = filter5x5(image, level_logits[:, :KERNEL_TAPS].softmax(1))
+        fine = filtered(image, level_logits[:, :KERNEL_TAPS].softmax(1))
         if out is not None:
-            correction = F.interpolate(out - F.avg_pool2d(filtered, 2), scale_factor=2, mode="bilinear")
-            filtered = filtered + level_logits[:, KERNEL_TAPS:].sigmoid() * correction
-        out = filtered
-    out, filtered = out.split((len(color), len(out) - len(color)))
+            correction = F.interpolate(out - F.avg_pool2d(fine, 2), scale_factor=2, mode="bilinear")
+            fine = fine + level_logits[:, KERNEL_TAPS:].sigmoid() * correction
+        out = fine
+    out, others = out.split((len(color), len(out) - len(color)))
     denoised = out.clamp_min(DARKEST) ** (1 / KERNEL_GAMMA) * (out > DARKEST)
-    return denoised, None if layers is None else filtered
+    return denoised, None if layers is None else others
 
 
-def filter5x5(image: Tensor, kernels: Tensor) -> Tensor:
-    """The mean of each pixel's 5x5 neighbours with its own weights [B, 25, H, W]; the border is replicated."""
+def filtered(image: Tensor, kernels: Tensor) -> Tensor:
+    """The mean of each pixel's neighbours with its own weights [B, side^2, H, W]; the border is replicated."""
     height, width = image.shape[-2:]
-    padded = F.pad(image, (2, 2, 2, 2), mode="replicate")
-    windows = (padded[..., i // 5 : i // 5 + height, i % 5 : i % 5 + width] for i in range(KERNEL_TAPS))
+    side = math.isqrt(kernels.shape[1])
+    padded = F.pad(image, [side // 2] * 4, mode="replicate")
+    windows = (padded[..., y : y + height, x : x + width] for y in range(side) for x in range(side))
     return sum(window * kernels[:, i : i + 1] for i, window in enumerate(windows))
 
 

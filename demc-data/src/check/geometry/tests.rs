@@ -40,6 +40,7 @@ fn room(camera: Vector) -> Frame {
         reference: None,
         mask: Some(vec![1.0; pixels]),
         alpha: None,
+        passes: None,
         clamped: 0,
     }
 }

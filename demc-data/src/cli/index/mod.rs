@@ -3,12 +3,13 @@
 mod found;
 mod rules;
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use demc_program::file::FileId;
 use demc_program::message::{self, printable};
 use demc_program::output::{Directories, Outputs};
 use demc_program::{exit, file};
@@ -59,7 +60,7 @@ impl Arguments {
         outputs.claim(&manifest, self.overwrite)?;
         outputs.prepare(Directories::Expect)?;
         let mut before = if exists {
-            Before::read(&manifest)?
+            Before::read(&self.root, &manifest)?
         } else {
             Before::default()
         };
@@ -70,6 +71,8 @@ impl Arguments {
         let scenes = rules.scenes(&self.root, &found, |file| before.kept(file))?;
         let count = |split: Split| scenes.iter().filter(|scene| scene.split == split).count();
         let bases: BTreeSet<&str> = scenes.iter().map(|scene| scene.base.as_str()).collect();
+        let mut entries: Vec<Value> = scenes.iter().map(|scene| before.entry(scene)).collect();
+        let elsewhere = before.elsewhere();
         let mut summary = format!(
             "{}: {} scenes ({} train, {} test) of {} base scenes, layout {}",
             manifest.display(),
@@ -82,7 +85,13 @@ impl Arguments {
         if ignored > 0 {
             summary += &format!("; other files and links, ignored: {ignored}");
         }
-        let entries: Vec<Value> = scenes.iter().map(|scene| before.entry(scene)).collect();
+        if !elsewhere.is_empty() {
+            summary += &format!(
+                "; scenes of the old manifest in other directories, kept: {}",
+                elsewhere.len()
+            );
+            entries.extend(elsewhere);
+        }
         let gone = before.scenes.len();
         if gone > 0 {
             summary += &format!("; scenes of the old manifest without a file, dropped: {gone}");
@@ -98,10 +107,11 @@ impl Arguments {
 
 /// The manifest that is replaced.
 struct Before {
+    root: PathBuf,
     /// Its keys, with an empty list of scenes.
     keys: Map<String, Value>,
-    /// Its entries by file.
-    scenes: HashMap<String, Map<String, Value>>,
+    /// Its entries by file, whatever its path.
+    scenes: BTreeMap<FileId, Map<String, Value>>,
 }
 
 impl Default for Before {
@@ -109,18 +119,22 @@ impl Default for Before {
         let mut keys = Map::new();
         keys.insert("format".to_owned(), FORMAT.into());
         Self {
+            root: PathBuf::new(),
             keys,
-            scenes: HashMap::new(),
+            scenes: BTreeMap::new(),
         }
     }
 }
 
 impl Before {
-    fn read(path: &Path) -> Result<Self> {
+    fn read(root: &Path, path: &Path) -> Result<Self> {
         let shown = path.display();
-        let text =
-            file::read_text(path, MAX_MANIFEST).with_context(|| format!("cannot read {shown}"))?;
-        let mut before = Self::default();
+        let text = file::read_regular_text(path, MAX_MANIFEST)
+            .with_context(|| format!("cannot read {shown}"))?;
+        let mut before = Self {
+            root: root.to_owned(),
+            ..Self::default()
+        };
         let keys: Map<String, Value> =
             serde_json::from_str(&text).with_context(|| format!("{shown} is not a manifest"))?;
         before.keys.extend(keys);
@@ -133,7 +147,7 @@ impl Before {
             if let Value::Object(scene) = scene
                 && let Some(Value::String(file)) = scene.get("file")
             {
-                before.scenes.insert(file.clone(), scene);
+                before.scenes.insert(FileId::of(&root.join(file)), scene);
             }
         }
         Ok(before)
@@ -141,7 +155,7 @@ impl Before {
 
     /// What a file is in it.
     fn kept(&self, file: &str) -> Kept {
-        let Some(scene) = self.scenes.get(file) else {
+        let Some(scene) = self.scenes.get(&FileId::of(&self.root.join(file))) else {
             return Kept::default();
         };
         let split = scene.get("split").cloned();
@@ -150,6 +164,19 @@ impl Before {
             split: split.and_then(|split| serde_json::from_value(split).ok()),
             base: base.map(str::to_owned),
         }
+    }
+
+    /// Takes the entries whose files exist, but were not found in the directory: those of `../other/a.exr`.
+    fn elsewhere(&mut self) -> Vec<Value> {
+        let exists = |scene: &Map<String, Value>| {
+            let file = scene.get("file").and_then(Value::as_str);
+            file.is_some_and(|file| self.root.join(file).exists())
+        };
+        let scenes = std::mem::take(&mut self.scenes);
+        let (kept, gone) = scenes.into_iter().partition(|(_, scene)| exists(scene));
+        self.scenes = gone;
+        let kept: BTreeMap<FileId, Map<String, Value>> = kept;
+        kept.into_values().map(Value::Object).collect()
     }
 
     /// The new entry of a scene, with the other keys of its old one.
@@ -162,7 +189,8 @@ impl Before {
             "width": scene.width,
             "height": scene.height,
         });
-        if let (Some(entry), Some(old)) = (entry.as_object_mut(), self.scenes.remove(&scene.file)) {
+        let file = FileId::of(&self.root.join(&scene.file));
+        if let (Some(entry), Some(old)) = (entry.as_object_mut(), self.scenes.remove(&file)) {
             for (key, value) in old {
                 entry.entry(key).or_insert(value);
             }

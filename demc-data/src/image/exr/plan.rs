@@ -3,7 +3,9 @@
 use std::fmt;
 use std::io::{Read, Seek};
 
-use ::exr::meta::attribute::{AttributeValue, ChannelList, LevelMode, SampleType};
+use ::exr::meta::attribute::{
+    AttributeValue, ChannelDescription, ChannelList, LevelMode, SampleType,
+};
 use ::exr::meta::header::Header;
 use ::exr::meta::{BlockDescription, Headers};
 
@@ -110,6 +112,8 @@ pub(in crate::image) struct ReplacedNames<'a> {
     pub(in crate::image) alpha: Option<&'a str>,
     /// Further channels.
     pub(in crate::image) layers: &'a [String],
+    /// Channels that the output has more, beside the colour.
+    pub(in crate::image) added: &'a [&'a str],
 }
 
 pub(super) struct PlannedPart {
@@ -118,11 +122,25 @@ pub(super) struct PlannedPart {
     pub(super) channels: Option<Vec<ChannelOrigin>>,
 }
 
+/// Where the samples of an output channel come from.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct ChannelOrigin {
-    pub(super) index: usize,
-    /// The plane of denoised values that replaces it.
-    pub(super) plane: Option<usize>,
+pub(super) enum ChannelOrigin {
+    /// The input's channel of this index.
+    Input(usize),
+    /// This plane, in place of the input's channel of this index.
+    Replaced { index: usize, plane: usize },
+    /// This plane, for the added channel of this index.
+    Added { index: usize, plane: usize },
+}
+
+impl ChannelOrigin {
+    /// The plane of denoised values.
+    pub(super) fn plane(self) -> Option<usize> {
+        match self {
+            Self::Input(_) => None,
+            Self::Replaced { plane, .. } | Self::Added { plane, .. } => Some(plane),
+        }
+    }
 }
 
 impl RewritePlan {
@@ -134,24 +152,36 @@ impl RewritePlan {
     ) -> Result<Self, Error> {
         let replaced = replaced_channels(file, names, samples)?;
         let color = &replaced[..3];
+        let added = |part: usize| {
+            let planes = (0..names.added.len()).map(|index| ChannelOrigin::Added {
+                index,
+                plane: replaced.len() + index,
+            });
+            planes.filter(move |_| part == color[0].part)
+        };
         let mut plan = Self {
             headers: Headers::new(),
             parts: Vec::new(),
             changes: Vec::new(),
         };
         for (input, header) in file.source.meta.headers.iter().enumerate() {
-            let origins: Vec<ChannelOrigin> = file
+            let mut origins: Vec<ChannelOrigin> = file
                 .channels()
                 .iter()
                 .filter(|channel| channel.part == input)
                 .filter_map(|channel| origin(channel, &replaced, color, options.channels))
+                .chain(added(input))
                 .collect();
             if origins.is_empty() {
                 continue;
             }
-            let colored = origins.iter().any(|origin| origin.plane.is_some());
+            let colored = origins.iter().any(|origin| origin.plane().is_some());
             let mut header = if colored {
-                colored_header(header, &origins, options, &mut plan.changes)
+                let described = described(header, &origins, names.added, options);
+                origins = described.iter().map(|(origin, _)| *origin).collect();
+                let channels = described.into_iter().map(|(_, channel)| channel);
+                let list = ChannelList::new(channels.collect());
+                colored_header(header, list, &origins, options, &mut plan.changes)
             } else {
                 header.clone()
             };
@@ -175,13 +205,15 @@ fn replaced_channels<'a, R: Read + Seek>(
         color,
         alpha,
         layers,
+        added,
     } = *names;
     let required: Vec<&str> = color.iter().chain(layers).map(String::as_str).collect();
     file.require(&required)?;
     let find = |name: &String| file.channel(name);
     let mut channels: Vec<&Channel> = color.iter().filter_map(find).collect();
     let (first, window) = (channels[0], channels[0].window);
-    if samples == (4 + layers.len()) * window.width * window.height {
+    let pixels = window.width * window.height;
+    if samples == (4 + layers.len() + added.len()) * pixels {
         channels.extend(alpha.and_then(|name| file.channel(name)));
     }
     channels.extend(layers.iter().filter_map(find));
@@ -194,7 +226,7 @@ fn replaced_channels<'a, R: Read + Seek>(
             b_window: other.window.to_string(),
         });
     }
-    if channels.len() * window.width * window.height != samples {
+    if (channels.len() + added.len()) * pixels != samples {
         let detail = format!("{samples} samples of colour do not match {window}, its current size");
         return Err(undecodable(file.path(), detail));
     }
@@ -212,8 +244,13 @@ fn origin(
     let plane = replaced
         .iter()
         .position(|c| (c.part, c.index) == (channel.part, index));
-    let stays = plane.is_some() || keep == OutputChannels::All || is_alpha(channel, color);
-    stays.then_some(ChannelOrigin { index, plane })
+    match plane {
+        Some(plane) => Some(ChannelOrigin::Replaced { index, plane }),
+        None if keep == OutputChannels::All || is_alpha(channel, color) => {
+            Some(ChannelOrigin::Input(index))
+        }
+        None => None,
+    }
 }
 
 /// Whether this is an alpha channel of the colour: `A` beside `R`, or `beauty.A` beside `beauty.R`,
@@ -228,31 +265,54 @@ fn is_alpha(channel: &Channel, color: &[&Channel]) -> bool {
     suffix.eq_ignore_ascii_case("a") && color.iter().any(beside)
 }
 
+/// The channels of a part with colour, in the order of their names.
+fn described(
+    input: &Header,
+    origins: &[ChannelOrigin],
+    added: &[&str],
+    options: &WriteOptions,
+) -> Vec<(ChannelOrigin, ChannelDescription)> {
+    let kind = |own: SampleType| match options.precision {
+        Some(SamplePrecision::Half) => SampleType::F16,
+        None if own == SampleType::F16 => SampleType::F16,
+        _ => SampleType::F32,
+    };
+    let describe = |origin: &ChannelOrigin| {
+        let channel = match *origin {
+            ChannelOrigin::Input(index) => input.channels.list[index].clone(),
+            ChannelOrigin::Replaced { index, .. } => {
+                let channel = input.channels.list[index].clone();
+                ChannelDescription {
+                    sample_type: kind(channel.sample_type),
+                    ..channel
+                }
+            }
+            ChannelOrigin::Added { index, .. } => {
+                ChannelDescription::named(added[index], kind(SampleType::F32))
+            }
+        };
+        (*origin, channel)
+    };
+    let mut described: Vec<_> = origins.iter().map(describe).collect();
+    described.sort_by(|(_, a), (_, b)| a.name.cmp(&b.name));
+    described
+}
+
 /// The header of a part with colour.
 fn colored_header(
     input: &Header,
+    channels: ChannelList,
     origins: &[ChannelOrigin],
     options: &WriteOptions,
     changes: &mut Vec<Change>,
 ) -> Header {
     let name = input.own_attributes.layer_name.as_ref();
     let part = name.map_or(String::new(), printable);
-    let written = origins.iter().map(|origin| {
-        let mut channel = input.channels.list[origin.index].clone();
-        if origin.plane.is_some() {
-            channel.sample_type = match options.precision {
-                Some(SamplePrecision::Half) => SampleType::F16,
-                None if channel.sample_type == SampleType::F16 => SampleType::F16,
-                _ => SampleType::F32,
-            };
-        }
-        channel
-    });
-    let channels = ChannelList::new(written.collect());
-
     let lossless = |compression: Compression| {
-        let others = origins.iter().filter(|origin| origin.plane.is_none());
-        let mut kinds = others.map(|origin| input.channels.list[origin.index].sample_type);
+        let mut kinds = origins.iter().filter_map(|origin| match origin {
+            ChannelOrigin::Input(index) => Some(input.channels.list[*index].sample_type),
+            _ => None,
+        });
         kinds.all(|kind| compression.method().is_lossless_for(kind))
     };
     let compression = match (options.compression, Compression::of(input.compression)) {

@@ -197,7 +197,7 @@ fn assemble(
         let block = carried.blocks.get(&carried.grid.place(Vec2(x, y)));
         for (channel, content) in header.channels.list.iter().zip(&carried.contents) {
             match content {
-                ChannelContent::Replaced(plane) => {
+                ChannelContent::New(plane) => {
                     let start = (plane * image_height + y) * image_width + x;
                     let line = &planes[start..start + width];
                     clamped += put(line, channel.sample_type, &mut data);
@@ -241,8 +241,8 @@ pub(super) fn compress(
 }
 
 enum ChannelContent {
-    /// By this plane.
-    Replaced(usize),
+    /// This plane.
+    New(usize),
     Carried(SampleSpan),
 }
 
@@ -258,9 +258,11 @@ struct CarriedChannels {
 impl CarriedChannels {
     fn new(part: usize, grid: BlockGrid, input: &Header, origins: &[ChannelOrigin]) -> Self {
         let spans = SampleSpan::all(&input.channels);
-        let content = |origin: &ChannelOrigin| match origin.plane {
-            Some(plane) => ChannelContent::Replaced(plane),
-            None => ChannelContent::Carried(spans[origin.index]),
+        let content = |origin: &ChannelOrigin| match *origin {
+            ChannelOrigin::Input(index) => ChannelContent::Carried(spans[index]),
+            ChannelOrigin::Replaced { plane, .. } | ChannelOrigin::Added { plane, .. } => {
+                ChannelContent::New(plane)
+            }
         };
         Self {
             part,

@@ -53,7 +53,10 @@ pub struct Frame {
     pub mask: Option<Vec<f32>>,
     /// Alpha of the colour `[H, W]`, if the layout names it and the file has it.
     pub alpha: Option<Vec<f32>>,
-    /// Number of negative samples of colour and reference that were set to 0.
+    /// The passes `[20, H, W]` in the order of [`PASSES`](crate::input::kpcn::PASSES), for KPCN; the depth
+    /// is divided by its largest value.
+    pub passes: Option<Vec<f32>>,
+    /// Number of negative samples of colour, its parts, and the reference that were set to 0.
     pub clamped: usize,
 }
 
@@ -79,6 +82,7 @@ impl Frame {
             reference: None,
             mask: None,
             alpha: None,
+            passes: None,
             clamped: 0,
         }
     }
@@ -101,7 +105,11 @@ pub struct FramePlanes {
     pub mask: Option<Plane>,
     /// Alpha of the colour.
     pub alpha: Option<Plane>,
-    /// Number of negative samples of colour and reference that were set to 0.
+    /// The passes, for KPCN: 20 planes, as in [`Frame`].
+    pub passes: Option<Vec<Plane>>,
+    /// Both parts of the reference, for KPCN: 6 planes.
+    pub reference_passes: Option<Vec<Plane>>,
+    /// Number of negative samples of colour, its parts, and the reference that were set to 0.
     pub clamped: usize,
     /// Factor on colour and reference before the network ([`Preparation`](crate::input::preparation::Preparation)).
     pub exposure_scale: f32,
@@ -126,6 +134,8 @@ impl FramePlanes {
             .chain(&self.features)
             .chain(&self.mask)
             .chain(&self.alpha)
+            .chain(self.passes.iter().flatten())
+            .chain(self.reference_passes.iter().flatten())
             .map(Plane::bytes)
             .sum()
     }

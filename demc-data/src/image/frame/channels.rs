@@ -7,7 +7,8 @@ use super::buffers::{FEATURES, POSITIONS, Presence, TEXTURES};
 use crate::error::Error;
 use crate::image::channel::Window;
 use crate::image::exr::ExrFile;
-use crate::image::layout::{ChannelLayout, Missing, Triple};
+use crate::image::layout::{ChannelLayout, InputKind, Missing, Triple};
+use crate::input::kpcn;
 
 /// The channels of a frame; `None` stands for zeros.
 pub(super) struct FrameChannels<'a> {
@@ -16,6 +17,9 @@ pub(super) struct FrameChannels<'a> {
     pub(super) reference: Option<Vec<Option<&'a str>>>,
     pub(super) mask: Vec<Option<&'a str>>,
     pub(super) alpha: Vec<Option<&'a str>>,
+    /// For KPCN.
+    pub(super) passes: Vec<String>,
+    pub(super) reference_passes: Vec<String>,
 }
 
 impl<'a> FrameChannels<'a> {
@@ -65,7 +69,19 @@ impl<'a> FrameChannels<'a> {
             Presence::Skip => Presence::Skip,
             _ => Presence::IfPresent,
         };
+        let passes = |passes: &[(&str, usize)]| -> Result<Vec<String>, Error> {
+            let contents = passes.iter().map(|pass| pass.0);
+            match layout.inputs {
+                InputKind::Demc => Ok(Vec::new()),
+                InputKind::Kpcn => Ok(pass_channels(file, layout, contents)?.concat()),
+            }
+        };
         let wanted = Self {
+            passes: passes(&kpcn::PASSES)?,
+            reference_passes: match &reference {
+                Some(_) => passes(&kpcn::REFERENCE_PASSES)?,
+                None => Vec::new(),
+            },
             color: slots(&layout.color),
             features,
             reference: reference.map(slots),
@@ -77,7 +93,7 @@ impl<'a> FrameChannels<'a> {
     }
 
     /// The channels to decode, in the order of the fields; a copied texture appears twice.
-    pub(super) fn names(&self) -> Vec<&'a str> {
+    pub(super) fn names(&self) -> Vec<&str> {
         let radiance_and_features = self.color.iter().chain(&self.features);
         radiance_and_features
             .chain(self.reference.iter().flatten())
@@ -85,6 +101,8 @@ impl<'a> FrameChannels<'a> {
             .chain(&self.alpha)
             .copied()
             .flatten()
+            .chain(self.passes.iter().map(String::as_str))
+            .chain(self.reference_passes.iter().map(String::as_str))
             .collect()
     }
 
@@ -114,6 +132,34 @@ impl<'a> FrameChannels<'a> {
             }),
         }
     }
+}
+
+/// The channels of each pass, by its [content](crate::image::layout::NamedBuffer::content).
+///
+/// # Errors
+/// [`Error::MissingPasses`] for passes that the layout does not name or the file lacks.
+pub(super) fn pass_channels<'a, R: Read + Seek>(
+    file: &ExrFile<R>,
+    layout: &ChannelLayout,
+    contents: impl Iterator<Item = &'a str>,
+) -> Result<Vec<Vec<String>>, Error> {
+    let named = layout.buffers();
+    let (mut channels, mut missing) = (Vec::new(), Vec::new());
+    for content in contents {
+        match named.iter().find(|buffer| buffer.content == content) {
+            Some(buffer) => channels.push(buffer.channels.clone()),
+            None => missing.push(content.to_owned()),
+        }
+    }
+    let names = channels.iter().flatten();
+    missing.extend(names.filter(|name| file.channel(name).is_none()).cloned());
+    if missing.is_empty() {
+        return Ok(channels);
+    }
+    Err(Error::MissingPasses {
+        path: file.path().to_owned(),
+        missing,
+    })
 }
 
 fn slots(names: &Triple) -> Vec<Option<&str>> {

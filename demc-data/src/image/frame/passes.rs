@@ -2,6 +2,7 @@
 
 use std::io::{Read, Seek};
 
+use super::channels::pass_channels;
 use super::read::finite;
 use crate::error::Error;
 use crate::image::exr::ExrFile;
@@ -24,32 +25,20 @@ pub struct PassPlanes {
 /// # Errors
 /// [`Error::MissingPasses`] for buffers that the layout does not name or the file lacks, [`Error::Sizes`]
 /// and [`Error::NonFinite`] for unusable ones, and as [`ExrFile::read`].
+///
+/// # Panics
+/// If `contents` is empty.
 pub fn decode_passes<R: Read + Seek>(
     file: &mut ExrFile<R>,
     layout: &ChannelLayout,
     contents: &[&str],
 ) -> Result<PassPlanes, Error> {
     let path = file.path().to_owned();
-    let named = layout.in_file(file, None)?.buffers();
-    let (mut channels, mut missing) = (Vec::new(), Vec::new());
-    for content in contents {
-        match named.iter().find(|buffer| buffer.content == *content) {
-            Some(buffer) => channels.push(&buffer.channels),
-            None => missing.push((*content).to_owned()),
-        }
-    }
-    let names: Vec<&str> = channels
-        .iter()
-        .copied()
-        .flatten()
-        .map(String::as_str)
-        .collect();
-    let absent = names.iter().filter(|name| file.channel(name).is_none());
-    missing.extend(absent.map(|name| (*name).to_owned()));
+    let layout = layout.in_file(file, None)?;
+    let channels = pass_channels(file, &layout, contents.iter().copied())?;
+    let names: Vec<&str> = channels.iter().flatten().map(String::as_str).collect();
     let windows: Vec<_> = names.iter().filter_map(|name| file.channel(name)).collect();
-    let (Some(first), []) = (windows.first(), &missing[..]) else {
-        return Err(Error::MissingPasses { path, missing });
-    };
+    let first = windows.first().expect("a request has contents");
     let window = first.window;
     if let Some(other) = windows.iter().find(|channel| channel.window != window) {
         return Err(Error::Sizes {

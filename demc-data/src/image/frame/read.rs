@@ -12,6 +12,7 @@ use crate::image::channel::Window;
 use crate::image::exr::ExrFile;
 use crate::image::layout::ChannelLayout;
 use crate::image::plane::{NonFiniteSamples, Plane, clear_infinite};
+use crate::input::kpcn;
 
 /// Reads and checks an image. Reference and mask are read if present.
 ///
@@ -98,6 +99,7 @@ pub(crate) fn frame_of(planes: FramePlanes, path: &Path) -> Result<Frame, Error>
         reference: planes.reference.map(planar).transpose()?,
         mask: plane(planes.mask)?,
         alpha: plane(planes.alpha)?,
+        passes: planes.passes.map(planar).transpose()?,
         clamped: planes.clamped,
     })
 }
@@ -177,16 +179,33 @@ impl FramePlanes {
             reference: wanted.reference.as_deref().map(&mut take).transpose()?,
             mask: take(&wanted.mask)?.pop(),
             alpha: take(&wanted.alpha)?.pop(),
+            passes: all_of(&mut decoded, wanted.passes.len())?,
+            reference_passes: all_of(&mut decoded, wanted.reference_passes.len())?,
             clamped: 0,
             exposure_scale: 1.0,
         };
+        let passes = planes.passes.iter_mut().flatten();
         let radiance = planes
             .color
             .iter_mut()
-            .chain(planes.reference.iter_mut().flatten());
+            .chain(planes.reference.iter_mut().flatten())
+            .chain(passes.take(kpcn::LIGHT))
+            .chain(planes.reference_passes.iter_mut().flatten());
         planes.clamped = radiance.map(Plane::clamp_negative).sum();
+        if let Some(passes) = &mut planes.passes {
+            kpcn::normalise_depth(passes);
+        }
         Ok((planes, repaired))
     }
+}
+
+/// The next `count` planes; `None` for none.
+fn all_of(
+    planes: &mut impl Iterator<Item = Result<Plane, Error>>,
+    count: usize,
+) -> Result<Option<Vec<Plane>>, Error> {
+    let planes: Vec<Plane> = planes.take(count).collect::<Result<_, _>>()?;
+    Ok((!planes.is_empty()).then_some(planes))
 }
 
 /// Checks a file's header: it has the channels of the layout and `reference`, in buffers of one

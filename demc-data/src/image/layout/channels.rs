@@ -42,6 +42,25 @@ pub const PRESETS: [(&str, &str); 6] = [
     ),
 ];
 
+/// What networks take as input.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum InputKind {
+    /// Colour and twelve feature channels (Sec. 3.1).
+    #[default]
+    Demc,
+    /// Diffuse and specular light, normal, albedo, depth, and variances: the passes of
+    /// [`crate::input::kpcn`].
+    Kpcn,
+}
+
+impl InputKind {
+    /// Whether this is colour and features.
+    pub fn is_demc(&self) -> bool {
+        *self == Self::Demc
+    }
+}
+
 /// The channel names of a renderer's files.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -79,6 +98,9 @@ pub struct ChannelLayout {
     /// Policies for missing feature buffers.
     #[serde(default)]
     pub missing: MissingPolicies,
+    /// What is read for the network. Set by the model, not by the author of a layout.
+    #[serde(default, skip_serializing_if = "InputKind::is_demc")]
+    pub inputs: InputKind,
 }
 
 /// Other names of each feature buffer. If a file has none of a buffer's channels, the first names of

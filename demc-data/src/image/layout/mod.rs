@@ -28,7 +28,8 @@ mod passes;
 mod tests;
 
 pub use channels::{
-    ANY_LAYER, Alternatives, ChannelLayout, FeatureBuffer, Missing, MissingPolicies, PRESETS,
+    ANY_LAYER, Alternatives, ChannelLayout, FeatureBuffer, InputKind, Missing, MissingPolicies,
+    PRESETS,
 };
 pub use detect::{FileLayout, detect};
 pub use passes::{NamedBuffer, Passes, Triple};

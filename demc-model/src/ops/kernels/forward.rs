@@ -7,8 +7,8 @@ use demc_kernels::blend::Scales;
 use demc_kernels::filter::Filter;
 use demc_kernels::rel_mse::RelMse;
 use demc_kernels::{
-    Convolution, Grid, Isa, batch_norm, blend, conv1x1, conv3x3, deconv4x4, filter, grid, pool,
-    rel_mse,
+    Convolution, Grid, Isa, batch_norm, blend, conv1x1, conv3x3, conv5x5, deconv4x4, filter, grid,
+    pool, rel_mse,
 };
 
 use super::{KernelOps, buffer, contiguous, dims, grid, maps, tensor, values};
@@ -36,22 +36,11 @@ impl KernelOps for Flex {
     }
 
     fn conv3x3(x: FlexTensor, weight: FlexTensor, bias: FlexTensor, relu: bool) -> FlexTensor {
-        let [x, weight, bias] = [x, weight, bias].map(contiguous);
-        let (grid, _) = grid(&x);
-        let [outputs, ..] = dims::<4>(&weight);
-        let mut y = buffer(grid.pixels() * outputs);
-        conv3x3::forward(
-            Isa::current(),
-            grid,
-            values(&x),
-            Convolution {
-                weight: values(&weight),
-                bias: values(&bias),
-                relu,
-            },
-            &mut y,
-        );
-        maps(grid, y)
+        convolution(conv3x3::forward, [x, weight, bias], relu)
+    }
+
+    fn conv5x5(x: FlexTensor, weight: FlexTensor, bias: FlexTensor, relu: bool) -> FlexTensor {
+        convolution(conv5x5::forward, [x, weight, bias], relu)
     }
 
     fn deconv4x4(x: FlexTensor, weight: FlexTensor, bias: FlexTensor, relu: bool) -> FlexTensor {
@@ -114,7 +103,7 @@ impl KernelOps for Flex {
         maps(grid.halved(), y)
     }
 
-    fn filter5x5(x: FlexTensor, logits: FlexTensor) -> FlexTensor {
+    fn filter(x: FlexTensor, logits: FlexTensor) -> FlexTensor {
         let [x, logits] = [x, logits].map(contiguous);
         let ((images, _), (grid, channels)) = (grid(&x), grid(&logits));
         let mut y = buffer(images.pixels() * (filter::outputs(channels)));
@@ -209,6 +198,28 @@ impl KernelOps for Flex {
         let [out_gamma, ref_hdr] = [out_gamma, ref_hdr].map(contiguous);
         rel_mse_into(&out_gamma, &ref_hdr, gamma, epsilon, None)
     }
+}
+
+/// A convolution that keeps the size.
+///
+/// # Shapes
+/// Maps `[B, H, W, in]`, weight `[out, in, side, side]`, and bias `[out]` to `[B, H, W, out]`.
+fn convolution(
+    kernel: fn(Isa, Grid, &[f32], Convolution, &mut [f32]),
+    operands: [FlexTensor; 3],
+    relu: bool,
+) -> FlexTensor {
+    let [x, weight, bias] = operands.map(contiguous);
+    let (grid, _) = grid(&x);
+    let [outputs, ..] = dims::<4>(&weight);
+    let mut y = buffer(grid.pixels() * outputs);
+    let convolution = Convolution {
+        weight: values(&weight),
+        bias: values(&bias),
+        relu,
+    };
+    kernel(Isa::current(), grid, values(&x), convolution, &mut y);
+    maps(grid, y)
 }
 
 /// The loss of each image. Writes the gradient with respect to the output into `dout` where given.

@@ -29,6 +29,13 @@ pub(super) trait KernelOps: Backend {
         bias: FloatTensor<Self>,
         relu: bool,
     ) -> FloatTensor<Self>;
+    /// Weight `[out, in, 5, 5]`.
+    fn conv5x5(
+        x: FloatTensor<Self>,
+        weight: FloatTensor<Self>,
+        bias: FloatTensor<Self>,
+        relu: bool,
+    ) -> FloatTensor<Self>;
     /// Weight `[in, out, 4, 4]`.
     fn deconv4x4(
         x: FloatTensor<Self>,
@@ -64,8 +71,8 @@ pub(super) trait KernelOps: Backend {
     fn max_pool(x: FloatTensor<Self>) -> FloatTensor<Self>;
     /// The mean of each 2x2 window; not differentiable.
     fn halve(x: FloatTensor<Self>) -> FloatTensor<Self>;
-    /// An image and 25 or 26 logits per pixel; the image has no gradient.
-    fn filter5x5(x: FloatTensor<Self>, logits: FloatTensor<Self>) -> FloatTensor<Self>;
+    /// An image and 25, 26, or 441 logits per pixel; the image has no gradient.
+    fn filter(x: FloatTensor<Self>, logits: FloatTensor<Self>) -> FloatTensor<Self>;
     /// A filtered image with its blend weight, and a coarser image.
     fn blend(filtered: FloatTensor<Self>, coarse: FloatTensor<Self>) -> FloatTensor<Self>;
     /// With the given statistics; not differentiable.
@@ -118,6 +125,20 @@ pub(super) fn conv3x3(
     ))
 }
 
+pub(super) fn conv5x5(
+    x: Tensor<4>,
+    weight: Tensor<4>,
+    bias: Tensor<1>,
+    activation: Activation,
+) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::conv5x5(
+        x.into_dispatch(),
+        weight.into_dispatch(),
+        bias.into_dispatch(),
+        activation.is_relu(),
+    ))
+}
+
 pub(super) fn deconv4x4(
     x: Tensor<4>,
     weight: Tensor<4>,
@@ -158,11 +179,8 @@ pub(super) fn halve(x: Tensor<4>) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::halve(x.into_dispatch()))
 }
 
-pub(super) fn filter5x5(x: Tensor<4>, logits: Tensor<4>) -> Tensor<4> {
-    Tensor::from_dispatch(Dispatch::filter5x5(
-        x.into_dispatch(),
-        logits.into_dispatch(),
-    ))
+pub(super) fn filter(x: Tensor<4>, logits: Tensor<4>) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::filter(x.into_dispatch(), logits.into_dispatch()))
 }
 
 pub(super) fn blend(filtered: Tensor<4>, coarse: Tensor<4>) -> Tensor<4> {

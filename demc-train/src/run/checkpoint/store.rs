@@ -147,7 +147,8 @@ impl CheckpointStore {
         let mut old: Vec<(u64, String)> = self
             .names()?
             .into_iter()
-            .filter(|entry| entry != name)
+            // Anything else of such a name is of another program, or damaged.
+            .filter(|entry| entry != name && all.join(entry).join(SUMS).is_file())
             .filter_map(|entry| Some((step_of(&entry)?, entry)))
             .collect();
         old.sort();
@@ -283,6 +284,21 @@ mod tests {
         assert_eq!(remaining(&store), kept);
         let latest = fs::read_to_string(dir.path().join(LATEST)).unwrap();
         assert_eq!(latest, "step-00000010\n");
+    }
+
+    #[test]
+    fn only_checkpoints_count() {
+        let (dir, store) = run(&[1, 2], 2);
+        fs::write(dir.path().join("checkpoints/step-00000009"), "").unwrap();
+        fs::create_dir(dir.path().join("checkpoints/step-00000008")).unwrap();
+        store.write(3, &[], None, 2).unwrap();
+        let kept = [
+            "step-00000002",
+            "step-00000003",
+            "step-00000008",
+            "step-00000009",
+        ];
+        assert_eq!(remaining(&store), kept);
     }
 
     #[test]

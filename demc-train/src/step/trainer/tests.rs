@@ -26,9 +26,10 @@ fn batch(size: usize, first: usize) -> Batch {
     };
     Batch {
         size,
-        color_gamma: pattern(3, 0.0),
-        features_z: pattern(12, 1.0),
+        color: pattern(3, 0.0),
+        features: pattern(12, 1.0),
         modulation: None,
+        reference_light: None,
         reference_hdr: pattern(3, 2.0),
         patch_size: 32,
         patches: (0..size as u32)
@@ -67,7 +68,7 @@ fn the_output_is_modulated_before_the_loss() {
     let trainer = trainer(&config);
     let plain = batch(2, 0);
     let twice = Batch {
-        modulation: Some(vec![2.0; plain.color_gamma.len()]),
+        modulation: Some(vec![2.0; plain.color.len()]),
         reference_hdr: plain
             .reference_hdr
             .iter()
@@ -125,7 +126,8 @@ fn a_step_on_kernels_updates_weights_in_place() {
     let config = config(2, 1);
     let mut trainer = trainer(&config);
     let address = |trainer: &Trainer| {
-        let conv = &trainer.model().encoders[0].levels[2].convs[1];
+        let network = trainer.model().dual_encoder().expect("a DEMC has encoders");
+        let conv = &network.encoders[0].levels[2].convs[1];
         let weight: Tensor<4> = conv.weight.val().inner();
         let weight = weight.try_into_primitive::<Flex>().expect("flex");
         weight.bytes().as_ptr() as usize
@@ -197,7 +199,7 @@ fn a_non_finite_step_is_skipped() {
     let specs = trainer.optimizer().specs();
     assert!(specs.iter().any(|spec| !spec.role.is_trainable()));
     let mut bad = batch(2, 0);
-    bad.features_z[40] = f32::NAN;
+    bad.features[40] = f32::NAN;
     let step = trainer
         .step(1e-3, || Ok::<_, Infallible>(bad.clone()))
         .expect("no batch fails");

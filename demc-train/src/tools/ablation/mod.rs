@@ -3,10 +3,13 @@
 //!
 //! [`AblationSpec`] describes the comparison. [`run`] trains the runs that are not complete, seed
 //! by seed, so that a stopped ablation has complete seeds. Each complete run adds its scores to
-//! [`results`]. [`Comparison`] summarises them in a table.
+//! [`results`]. Then [`baselines`], methods without training, are scored. [`Comparison`] summarises all
+//! in a table.
 
+pub mod baselines;
 pub mod comparison;
 mod figure;
+mod pictures;
 pub mod results;
 pub mod spec;
 mod table;
@@ -27,7 +30,7 @@ use crate::config::{Config, HASH_DIGITS};
 use crate::record::metrics_log;
 use crate::record::progress::say;
 use crate::run::checkpoint::store::CheckpointStore;
-use crate::run::data::{file_checksums, protect_inputs};
+use crate::run::data::{DataContents, protect_inputs};
 use crate::run::initial::read_init;
 use crate::run::place::SessionPlace;
 use crate::run::run_dir::{RunDir, SCORES};
@@ -104,7 +107,10 @@ pub fn run(
             let dir = planned[*index].config.run_dir().display();
             bail!("{dir}: no test split to compare on");
         }
-        Comparison::new(&progress.complete).with_context(|| spec.dir.display().to_string())
+        let mut runs = progress.complete;
+        runs.extend(baselines::scored(spec, &files)?);
+        pictures::write(spec)?;
+        Comparison::new(&runs).with_context(|| spec.dir.display().to_string())
     });
     let comparison = reduce.agree(compared.transpose())?;
     Ok(Outcome::Complete(comparison.map(Box::new)))
@@ -112,13 +118,15 @@ pub fn run(
 
 /// All runs, seed by seed.
 fn planned(spec: &AblationSpec) -> Vec<PlannedRun> {
-    let total = spec.seeds.len() * spec.variants.len();
+    let total: usize = spec.variants.iter().map(|variant| variant.seeds).sum();
     let runs = spec
         .seeds
         .iter()
-        .flat_map(|seed| {
+        .enumerate()
+        .flat_map(|(index, seed)| {
             let variants = spec.variants.iter();
-            variants.map(move |variant| (seed, variant))
+            let trained = variants.filter(move |variant| index < variant.seeds);
+            trained.map(move |variant| (seed, variant))
         })
         .enumerate()
         .map(|(index, (seed, variant))| PlannedRun {
@@ -130,15 +138,15 @@ fn planned(spec: &AblationSpec) -> Vec<PlannedRun> {
     runs.collect()
 }
 
-/// The checksums of the scenes of each data set, by its directory.
-type DataFiles = BTreeMap<PathBuf, BTreeMap<String, String>>;
+/// The contents of each data set, by its directory.
+type DataFiles = BTreeMap<PathBuf, DataContents>;
 
 fn data_files(spec: &AblationSpec) -> anyhow::Result<DataFiles> {
     let mut files = DataFiles::new();
     for variant in &spec.variants {
         let root = &variant.config.data.root;
         if !files.contains_key(root) {
-            files.insert(root.clone(), file_checksums(root)?);
+            files.insert(root.clone(), DataContents::of(root)?);
         }
     }
     Ok(files)
@@ -155,30 +163,31 @@ fn collect(
     let path = spec.dir.join(RESULTS);
     let stored = results::read(&path)?;
     let mut others = stored.clone();
-    let mut complete: Vec<Option<ScoredRun>> = Vec::new();
+    let mut found_runs: Vec<Option<ScoredRun>> = Vec::new();
     let mut notes = Vec::new();
     for run in planned {
         let is_stored =
             |row: &ScoredRun| row.variant == run.variant && row.seed == run.config.train.seed;
-        let scenes = &files[&run.config.data.root];
-        let hash = run.config.hash(scenes);
+        let data = &files[&run.config.data.root];
+        let hash = run.config.hash(&data.text);
         let is_same = |row: &&ScoredRun| is_stored(row) && row.configuration == hash;
         let in_file = || Some((stored.iter().find(is_same)?.clone(), path.as_path()));
-        let in_dir = finished(run, scenes)?.map(|found| (found, run.config.run_dir()));
+        let in_dir = finished(run, data)?.map(|found| (found, run.config.run_dir()));
         let found = in_dir.or_else(in_file);
         if let Some((_, place)) = &found {
             notes.push(format!("== {}: complete in {}", run.name, place.display()));
             others.retain(|row| !is_stored(row));
         }
-        complete.push(found.map(|(run, _)| run));
+        found_runs.push(found.map(|(run, _)| run));
     }
-    let missing = (0..planned.len()).filter(|index| complete[*index].is_none());
+    let missing = (0..planned.len()).filter(|index| found_runs[*index].is_none());
     let missing = missing.collect();
-    let variants = spec.variants.len();
-    let numbers = (0..variants).flat_map(|first| (first..planned.len()).step_by(variants));
-    let complete: Vec<ScoredRun> = numbers
-        .filter_map(|number| complete[number].take())
-        .collect();
+    let order = |run: &ScoredRun| {
+        let mut variants = spec.variants.iter();
+        variants.position(|variant| variant.name == run.variant)
+    };
+    let mut complete: Vec<ScoredRun> = found_runs.into_iter().flatten().collect();
+    complete.sort_by_key(order);
     let all = [complete.as_slice(), &others].concat();
     if all != stored {
         results::write(&path, &all)?;
@@ -243,17 +252,18 @@ fn check_outputs(spec: &AblationSpec) -> anyhow::Result<()> {
         protect_inputs(&mut outputs, &spec.files, &variant.config)?;
     }
     outputs.claim(&spec.dir.join(RESULTS), true)?;
-    for file in table::files(&spec.dir) {
+    for file in table::files(&spec.dir)
+        .into_iter()
+        .chain(pictures::files(spec))
+    {
         outputs.claim(&file, true)?;
     }
+    table::check_own(&spec.dir)?;
     Ok(outputs.prepare(Directories::Create)?)
 }
 
-/// The scores of a run whose directory is complete, on data with these checksums.
-fn finished(
-    run: &PlannedRun,
-    scenes: &BTreeMap<String, String>,
-) -> anyhow::Result<Option<ScoredRun>> {
+/// The scores of a run whose directory is complete, on this data.
+fn finished(run: &PlannedRun, data: &DataContents) -> anyhow::Result<Option<ScoredRun>> {
     let config = &run.config;
     let dir = config.run_dir();
     let scores = dir.join(SCORES);
@@ -269,7 +279,7 @@ fn finished(
         dir.display(),
         differences.join("; ")
     );
-    RunDir::unclaimed(config).check_files(scenes)?;
+    RunDir::unclaimed(config).check_files(&data.checksums)?;
     let text = fs::read_to_string(&scores).with_context(|| scores.display().to_string())?;
     let report: Report =
         serde_json::from_str(&text).with_context(|| scores.display().to_string())?;
@@ -279,7 +289,7 @@ fn finished(
     Ok(Some(ScoredRun {
         variant: run.variant.clone(),
         seed: config.train.seed,
-        configuration: config.hash(scenes),
+        configuration: config.hash(&data.text),
         weights,
         steps: config.train.steps,
         minutes: seconds / 60.0,
@@ -287,12 +297,12 @@ fn finished(
         parameters: config.model.parameter_count(),
         flops_per_pixel: config.model.flops_per_pixel(),
         settings: run.settings.clone(),
-        scores: report.images.iter().flat_map(values).collect(),
+        scores: report.images.iter().flat_map(values_of).collect(),
     }))
 }
 
 /// The values of all metrics of an image that have one.
-fn values(image: &ImageScore) -> impl Iterator<Item = ImageValue> {
+fn values_of(image: &ImageScore) -> impl Iterator<Item = ImageValue> {
     METRICS.iter().filter_map(|metric| {
         Some(ImageValue {
             image: image.name.clone(),
@@ -303,13 +313,14 @@ fn values(image: &ImageScore) -> impl Iterator<Item = ImageValue> {
     })
 }
 
-/// Compares the runs of the file `results` and writes table, numbers, and figure beside it. Returns
+/// Compares the runs of the file `results` and writes table, numbers, and figures beside it. Returns
 /// the comparison and the paths.
 ///
 /// # Errors
 /// A file without comparable runs; a file that cannot be written.
-pub fn remake(results: &Path) -> anyhow::Result<(Comparison, [PathBuf; 3])> {
+pub fn remake(results: &Path) -> anyhow::Result<(Comparison, [PathBuf; 4])> {
     let dir = results.parent().unwrap_or(Path::new(""));
+    ensure!(results.exists(), "{}: no such file", results.display());
     let runs = results::read(results)?;
     let comparison =
         Comparison::new(&runs).with_context(|| printable(&results.display().to_string()))?;
@@ -319,15 +330,16 @@ pub fn remake(results: &Path) -> anyhow::Result<(Comparison, [PathBuf; 3])> {
         outputs.claim(&file, true)?;
     }
     outputs.prepare(Directories::Expect)?;
+    table::check_own(dir)?;
     let paths = write(&comparison, dir)?;
     Ok((comparison, paths))
 }
 
-/// Writes table, numbers, and figure of a comparison into `dir`; returns the paths.
+/// Writes table, numbers, and figures of a comparison into `dir`; returns the paths.
 ///
 /// # Errors
 /// A file that cannot be written.
-pub fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<[PathBuf; 3]> {
+pub fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<[PathBuf; 4]> {
     table::write(comparison, dir)
 }
 

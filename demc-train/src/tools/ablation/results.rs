@@ -95,6 +95,11 @@ impl ScoredRun {
         fn number<T: std::str::FromStr>(row: &[String], column: usize) -> Result<T, &'static str> {
             row[column].parse().map_err(|_| HEADER[column])
         }
+        // NaN would count as the best error.
+        let value: f64 = number(row, 5)?;
+        if !value.is_finite() || row[4] == "relmse" && value < 0.0 {
+            return Err(HEADER[5]);
+        }
         Ok(ScoredRun {
             variant: row[0].clone(),
             seed: number(row, 1)?,
@@ -102,7 +107,7 @@ impl ScoredRun {
                 image: row[2].clone(),
                 base: row[3].clone(),
                 metric: row[4].clone(),
-                value: number(row, 5)?,
+                value,
             }],
             configuration: row[6].clone(),
             weights: row[7].clone(),
@@ -166,7 +171,15 @@ fn parse(text: &str) -> anyhow::Result<Vec<ScoredRun>> {
         let found = ScoredRun::of_row(&row)
             .map_err(|column| anyhow::anyhow!("{}: {column} is not a number", place()))?;
         match runs.iter_mut().find(|run| run.is_same(&found)) {
-            Some(run) => run.scores.extend(found.scores),
+            Some(run) => {
+                let [new] = &found.scores[..] else {
+                    unreachable!("a row has one score")
+                };
+                let is_new =
+                    |old: &ImageValue| (&old.image, &old.metric) != (&new.image, &new.metric);
+                ensure!(run.scores.iter().all(is_new), "{}: stands twice", place());
+                run.scores.extend(found.scores);
+            }
             None => runs.push(found),
         }
     }
@@ -272,7 +285,20 @@ pub(super) mod tests {
             error(&format!("{head}a,b\n"))
                 .contains("row 1 below the header: expected 14 values, found 2")
         );
-        let row = "DEMC,1,a,a,ssim,x,,,1,1,1,1,1,\n";
-        assert!(error(&format!("{head}{row}")).contains("value is not a number"));
+        let row = |metric: &str, value: &str| format!("DEMC,1,a,a,{metric},{value},,,1,1,1,1,1,\n");
+        for (metric, value) in [
+            ("ssim", "x"),
+            ("ssim", "NaN"),
+            ("relmse", "-5"),
+            ("relmse", "inf"),
+        ] {
+            let text = format!("{head}{}", row(metric, value));
+            assert!(
+                error(&text).contains("value is not a number"),
+                "{metric} {value}"
+            );
+        }
+        let twice = format!("{head}{0}{0}", row("ssim", "0.5"));
+        assert!(error(&twice).contains("row 2 below the header: stands twice"));
     }
 }

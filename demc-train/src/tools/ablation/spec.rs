@@ -13,10 +13,11 @@
 
 use std::path::{Path, PathBuf};
 
-use demc_model::ModelConfig;
+use demc_model::{ModelConfig, Variant};
 use demc_program::file::{MAX_CONFIGURATION, read_text};
 use serde::Deserialize;
 
+use super::baselines::Baseline;
 use crate::config::{Config, ConfigError, one_line};
 
 /// The key that `seeds` sets.
@@ -41,6 +42,12 @@ struct AblationFile {
     match_parameters: bool,
     /// The variants; the others are compared with the first.
     variants: Vec<VariantEntry>,
+    /// Methods without training.
+    #[serde(default)]
+    baselines: Vec<Baseline>,
+    /// Test scenes of which a picture is made.
+    #[serde(default)]
+    pictures: Vec<String>,
 }
 
 #[derive(Clone, Debug, Deserialize)]
@@ -51,6 +58,9 @@ struct VariantEntry {
     config: Option<PathBuf>,
     #[serde(default)]
     set: Vec<String>,
+    /// How many of the seeds, from the first on; all by default.
+    #[serde(default)]
+    seeds: Option<usize>,
 }
 
 fn one_seed() -> Vec<u64> {
@@ -72,6 +82,10 @@ pub struct AblationSpec {
     pub seeds: Vec<u64>,
     /// The variants, the reference first.
     pub variants: Vec<AblationVariant>,
+    /// Methods without training, which are scored beside the variants.
+    pub baselines: Vec<Baseline>,
+    /// Test scenes of which a picture is made.
+    pub pictures: Vec<String>,
 }
 
 /// A variant of an ablation.
@@ -81,6 +95,8 @@ pub struct AblationVariant {
     pub name: String,
     /// Its configuration; each run sets seed and directory.
     pub config: Config,
+    /// The number of seeds from which it is trained: the first ones of the ablation.
+    pub seeds: usize,
 }
 
 impl AblationSpec {
@@ -124,6 +140,7 @@ impl AblationSpec {
             variants.push(AblationVariant {
                 name: entry.name.clone(),
                 config: Config::load(config, &sets)?,
+                seeds: entry.seeds.unwrap_or(file.seeds.len()),
             });
         }
         if file.match_parameters {
@@ -134,6 +151,8 @@ impl AblationSpec {
             dir: file.dir,
             seeds: file.seeds,
             variants,
+            baselines: file.baselines,
+            pictures: file.pictures,
         };
         let first = &spec.variants[0];
         let runs = spec.seeds.iter().map(|seed| spec.run(first, *seed));
@@ -184,8 +203,25 @@ impl AblationFile {
                 problems.push(format!("seeds: {seed} is listed twice"));
             }
         }
-        if self.variants.len() < 2 {
-            problems.push("variants: expected at least two".into());
+        if self.variants.len() + self.baselines.len() < 2 || self.variants.is_empty() {
+            problems.push("variants: expected at least two, or one and a baseline".into());
+        }
+        for (i, VariantEntry { name, seeds, .. }) in self.variants.iter().enumerate() {
+            let most = self.seeds.len();
+            let least = if i == 0 { most } else { 1 };
+            if seeds.is_some_and(|seeds| !(least..=most).contains(&seeds)) {
+                problems.push(format!(
+                    "variants: {name}: seeds: expected {least} to {most}"
+                ));
+            }
+        }
+        let variants = self.variants.iter().map(|variant| &variant.name);
+        let mut names: Vec<&String> = variants.collect();
+        for Baseline { name, .. } in &self.baselines {
+            if name.trim().is_empty() || names.contains(&name) {
+                problems.push(format!("baselines: `{name}` is empty or listed twice"));
+            }
+            names.push(name);
         }
         for (i, VariantEntry { name, .. }) in self.variants.iter().enumerate() {
             let plain = |c: char| c.is_alphanumeric() || "-_+. ".contains(c);
@@ -200,11 +236,14 @@ impl AblationFile {
     }
 }
 
-/// Gives every other variant the width with the parameter count closest to the first one's.
+/// Gives every other variant with encoders the width with the parameter count closest to the first
+/// one's. KPCN keeps its own: the paper compares networks of different sizes.
 fn match_parameters(variants: &mut [AblationVariant]) {
     if let Some((first, others)) = variants.split_first_mut() {
         let parameters = first.config.model.parameter_count();
-        for variant in others {
+        let with_encoders =
+            |variant: &&mut AblationVariant| variant.config.model.variant != Variant::Kpcn;
+        for variant in others.iter_mut().filter(with_encoders) {
             let model = variant.config.model;
             variant.config.model = ModelConfig {
                 width: model.width_for(parameters),

@@ -4,33 +4,57 @@ use std::fmt::Write as _;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
-use demc_program::file::write_whole;
+use anyhow::{Context, ensure};
+use demc_program::file::{read_text, write_whole};
 
 use super::comparison::{Comparison, MetricScores, VariantScores};
-use super::figure::figure;
+use super::figure;
 use demc_infer::statistics::{Estimate, FEWEST_BASES, RESAMPLES};
 
-/// Name of all files, without extension.
-const STEM: &str = "ablation";
+/// The start of every table.
+const START: &str = "| variant |";
+/// Largest table that is read, in bytes (ours).
+const MAX_TABLE: u64 = 1 << 24;
 const MEGAPIXEL: f64 = 1e6;
 const GIGA: f64 = 1e9;
 
-/// Markdown, JSON, and figure.
-pub(super) fn files(dir: &Path) -> [PathBuf; 3] {
-    ["md", "json", "svg"].map(|ending| dir.join(format!("{STEM}.{ending}")))
+/// Markdown, JSON, changes, and bars.
+pub(super) fn files(dir: &Path) -> [PathBuf; 4] {
+    ["ablation.md", "ablation.json", "ablation.svg", "bars.svg"].map(|name| dir.join(name))
 }
 
-pub(super) fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<[PathBuf; 3]> {
-    let [table, numbers, picture] = files(dir);
+/// Checks that the table in `dir`, if there is one, is of this program.
+///
+/// # Errors
+/// One of another program.
+pub(super) fn check_own(dir: &Path) -> anyhow::Result<()> {
+    let [table, ..] = files(dir);
+    let Ok(text) = read_text(&table, MAX_TABLE) else {
+        return Ok(());
+    };
+    ensure!(
+        text.starts_with(START),
+        "{}: not written by ablate, which would replace it; move it",
+        table.display()
+    );
+    Ok(())
+}
+
+pub(super) fn write(comparison: &Comparison, dir: &Path) -> anyhow::Result<[PathBuf; 4]> {
+    let [table, numbers, changed, compared] = files(dir);
     let json = serde_json::to_string_pretty(comparison)? + "\n";
     for (path, text) in [(&table, markdown(comparison)), (&numbers, json)] {
         write_whole(path, |file| file.write_all(text.as_bytes()))?;
     }
-    figure(comparison)
-        .write(&dir.join(STEM))
-        .with_context(|| picture.display().to_string())?;
-    Ok([table, numbers, picture])
+    for (path, figure) in [
+        (&changed, figure::changes(comparison)),
+        (&compared, figure::bars(comparison)),
+    ] {
+        figure
+            .write(path)
+            .with_context(|| path.display().to_string())?;
+    }
+    Ok([table, numbers, changed, compared])
 }
 
 pub(super) fn markdown(comparison: &Comparison) -> String {
@@ -42,19 +66,15 @@ pub(super) fn markdown(comparison: &Comparison) -> String {
     } = comparison;
     let first = rows.first().map_or("", |row| &row.name);
     let mut text = format!(
-        "| variant | C | parameters | GFLOP / Mpx | training, min | RelMSE | against {first} | detectable | SSIM | against {first} | detectable |\n\
+        "{START} C | parameters | GFLOP / Mpx | training, min | RelMSE | against {first} | detectable | SSIM | against {first} | detectable |\n\
          |---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|\n"
     );
     for row in rows {
         let _ = writeln!(
             text,
-            "| {} | {} | {}{} | {:.0} | {:.1} | {} | {} |",
+            "| {} | {} | {} | {} |",
             row.name,
-            row.width,
-            row.parameters,
-            excess(row, &rows[0]),
-            row.flops_per_pixel * MEGAPIXEL / GIGA,
-            row.minutes,
+            costs(row, &rows[0]),
             cells(Some(&row.relmse)),
             cells(row.ssim.as_ref()),
         );
@@ -70,6 +90,14 @@ pub(super) fn markdown(comparison: &Comparison) -> String {
         let _ = writeln!(
             text,
             "- Fewer than {FEWEST_BASES} base scenes cannot show a difference."
+        );
+    }
+    for row in rows.iter().filter(|row| row.seeds.len() < seeds.len()) {
+        let seeds = count(row.seeds.len(), "seed");
+        let _ = writeln!(
+            text,
+            "- {}: {seeds} only, compared with the same seeds of {first}.",
+            row.name
         );
     }
     if seeds.len() == 1 {
@@ -117,6 +145,21 @@ fn explanation(comparison: &Comparison) -> [String; 7] {
         "RelMSE: Eq. 5, summed over rgb, linear HDR, smaller is better".into(),
         "SSIM: Wang et al. 2004 on clip(x, 0, 1)^(1/2.2), larger is better".into(),
     ]
+}
+
+/// Width, parameters, operations, and training time of a network.
+fn costs(row: &VariantScores, first: &VariantScores) -> String {
+    if row.width == 0 {
+        return "- | - | - | -".into();
+    }
+    format!(
+        "{} | {}{} | {:.0} | {:.1}",
+        row.width,
+        row.parameters,
+        excess(row, first),
+        row.flops_per_pixel * MEGAPIXEL / GIGA,
+        row.minutes,
+    )
 }
 
 /// ` (+0.3 %)` after a parameter count that differs from that of the first variant.

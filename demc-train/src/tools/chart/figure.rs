@@ -1,4 +1,4 @@
-//! What a figure shows: panels of lines, without a word on how they are drawn.
+//! What a figure shows: panels of lines or of categories, without a word on how they are drawn.
 
 /// A line of points in a [`LinePanel`].
 #[derive(Clone, Debug, PartialEq)]
@@ -46,3 +46,37 @@ pub struct LinePanel {
 /// A picture with panels side by side.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Figure(pub Vec<LinePanel>);
+
+/// A name with its value.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Category {
+    /// The name, at the left of the panel.
+    pub name: String,
+    /// The value.
+    pub value: f64,
+    /// The ends of its interval.
+    pub interval: Option<[f64; 2]>,
+    /// Index in the palette.
+    pub color: usize,
+}
+
+/// Named values below each other.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CategoryPanel {
+    /// Title above the panel.
+    pub title: String,
+    /// Label of the x axis.
+    pub x_label: String,
+    /// Spacing of the x axis.
+    pub x: AxisScale,
+    /// Whether bars reach from zero to the values, instead of points.
+    pub bars: bool,
+    /// From top to bottom.
+    pub rows: Vec<Category>,
+    /// A vertical line, such as at equality.
+    pub line: Option<f64>,
+}
+
+/// A picture with panels of categories side by side.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CategoryFigure(pub Vec<CategoryPanel>);

@@ -14,7 +14,7 @@ const PALETTE: [u32; 8] = [
 ];
 pub(super) const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
 pub(super) const GREY: RGBColor = RGBColor(0x77, 0x77, 0x77);
-const GRID: [RGBColor; 2] = [RGBColor(0xD0, 0xD0, 0xD0), RGBColor(0xEC, 0xEC, 0xEC)];
+pub(super) const GRID: [RGBColor; 2] = [RGBColor(0xD0, 0xD0, 0xD0), RGBColor(0xEC, 0xEC, 0xEC)];
 /// Text sizes of titles and of all other text, in drawing units.
 pub(super) const SIZES: [f64; 2] = [36.0, 30.0];
 pub(super) const ROW: i32 = 40;

@@ -1,9 +1,11 @@
-//! Charts as SVG: lines over steps or learning rates.
+//! Charts as SVG: lines over steps or learning rates, and named values.
 //!
 //! `plotters` draws axes, meshes, series and legends. This module adds the range and labels of axes
-//! (`axis`), the contents of a panel (`lines`), its `frame`, and the layout of panels (`page`). Text uses the viewer's `sans-serif` font, so no font is read here.
+//! (`axis`), the contents of a panel (`lines`, `categories`), its
+//! `frame`, and the layout of panels (`page`). Text uses the viewer's `sans-serif` font, so no font is read here.
 
 mod axis;
+mod categories;
 pub mod figure;
 mod frame;
 mod lines;
@@ -19,7 +21,8 @@ use anyhow::{Context, ensure};
 use demc_program::file::write_whole;
 use plotters::prelude::*;
 
-use figure::Figure;
+use figure::{CategoryFigure, Figure};
+use frame::Area;
 use page::FigurePage;
 
 /// Drawing units per pixel of the shown picture. `plotters` rounds coordinates to whole units; half
@@ -33,10 +36,18 @@ impl Figure {
     /// # Errors
     /// A stem without a file name; a file that cannot be written.
     pub fn write(&self, stem: &Path) -> anyhow::Result<PathBuf> {
-        let path = with_extension(stem, "svg")?;
-        let svg = svg(&FigurePage::new(self)).with_context(|| path.display().to_string())?;
-        write_whole(&path, |file| file.write_all(svg.as_bytes()))?;
-        Ok(path)
+        let page = FigurePage::new(self);
+        write_svg(stem, page.size(), |root| page.draw(root))
+    }
+}
+
+impl CategoryFigure {
+    /// Writes STEM.svg, complete or not at all: panels side by side. Returns its path.
+    ///
+    /// # Errors
+    /// As [`Figure::write`].
+    pub fn write(&self, stem: &Path) -> anyhow::Result<PathBuf> {
+        write_svg(stem, self.size(), |root| self.draw(root))
     }
 }
 
@@ -60,13 +71,20 @@ pub fn with_extension(stem: &Path, extension: &str) -> anyhow::Result<PathBuf> {
     Ok(path.into())
 }
 
-fn svg(page: &FigurePage) -> anyhow::Result<String> {
+/// Writes STEM.svg with what `draw` draws on this many drawing units.
+fn write_svg(
+    stem: &Path,
+    size: (u32, u32),
+    draw: impl for<'a> FnOnce(&Area<SVGBackend<'a>>) -> DrawResult<(), SVGBackend<'a>>,
+) -> anyhow::Result<PathBuf> {
+    let path = with_extension(stem, "svg")?;
     let mut text = String::new();
-    let size = page.size();
     let root = SVGBackend::with_string(&mut text, size).into_drawing_area();
-    page.draw(&root)?;
+    draw(&root).with_context(|| path.display().to_string())?;
     drop(root);
     let attributes = |width, height| format!("width=\"{width}\" height=\"{height}\"");
     let shown = attributes(size.0 / DENSITY, size.1 / DENSITY);
-    Ok(text.replacen(&attributes(size.0, size.1), &shown, 1))
+    let svg = text.replacen(&attributes(size.0, size.1), &shown, 1);
+    write_whole(&path, |file| file.write_all(svg.as_bytes()))?;
+    Ok(path)
 }

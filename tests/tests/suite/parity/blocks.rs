@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor};
 use demc_model::LossConfig;
+use demc_model::dual_encoder::DualEncoder;
 use demc_model::ops::{self, Activation, Maps};
 use demc_model::{Denoiser, Reading, Variant};
 
@@ -22,7 +23,10 @@ type BlockForward = fn(&Denoiser, Vec<Maps>) -> Vec<Maps>;
 #[test]
 fn fusion_is_pytorchs() {
     let forward: BlockForward = |model, inputs| {
-        let fusion = model.fusion.as_ref().expect("a DEMC has a fusion");
+        let fusion = encoders_of(model)
+            .fusion
+            .as_ref()
+            .expect("a DEMC has a fusion");
         inputs.into_iter().map(|x| fusion.forward(x)).collect()
     };
     in_both_readings("fusion", forward);
@@ -47,7 +51,7 @@ fn latent_is_pytorchs() {
     let forward: BlockForward = |model, inputs| {
         inputs
             .into_iter()
-            .map(|x| model.latent.forward(x))
+            .map(|x| encoders_of(model).latent.forward(x))
             .collect()
     };
     in_both_readings("latent", forward);
@@ -59,7 +63,7 @@ fn decoder_level_is_pytorchs() {
         let skips = inputs.split_off(1);
         inputs
             .into_iter()
-            .map(|x| model.decoder.levels[3].forward(x, skips.clone()))
+            .map(|x| encoders_of(model).decoder.levels[3].forward(x, skips.clone()))
             .collect()
     };
     in_both_readings("decoder.levels.3", forward);
@@ -72,7 +76,11 @@ fn head_is_pytorchs() {
         inputs
             .into_iter()
             .map(|x| {
-                let head = model.decoder.head.as_ref().expect("a convolution");
+                let head = encoders_of(model)
+                    .decoder
+                    .head
+                    .as_ref()
+                    .expect("a convolution");
                 match head.kernel_size {
                     [1, 1] => x.conv1x1(head),
                     _ => x.conv3x3(head, Activation::None),
@@ -109,8 +117,12 @@ fn loss_and_its_gradient_are_pytorchs_at_black_pixels_too() {
     );
 }
 
+fn encoders_of(model: &Denoiser) -> &DualEncoder {
+    model.dual_encoder().expect("a variant with encoders")
+}
+
 fn encode(model: &Denoiser, [encoder, level]: [usize; 2], inputs: Vec<Maps>) -> Vec<Maps> {
-    let level = &model.encoders[encoder].levels[level];
+    let level = &encoders_of(model).encoders[encoder].levels[level];
     let outputs = inputs.into_iter().map(|x| level.forward(x));
     outputs
         .flat_map(|(skip, below)| std::iter::once(skip).chain(below))

@@ -8,6 +8,7 @@
 //! `kernels`), so the fixtures test every backend of the build.
 
 mod blocks;
+mod kpcn;
 mod networks;
 
 use crate::tensors::Tolerance;

@@ -5,7 +5,9 @@ use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::flex::FlexTensor;
-use demc_kernels::{GradientSource, GradientTarget, Grid, Isa, conv1x1, conv3x3, deconv4x4};
+use demc_kernels::{
+    GradientSource, GradientTarget, Grid, Isa, conv1x1, conv3x3, conv5x5, deconv4x4,
+};
 
 use super::super::{buffer, contiguous, dims, grid, maps, tensor, values};
 
@@ -99,6 +101,7 @@ macro_rules! backward {
 }
 
 backward!(Conv3x3, conv3x3, 0);
+backward!(Conv5x5, conv5x5, 0);
 backward!(Deconv4x4, deconv4x4, 1);
 
 /// A fusion of `P` parts. Its `N` nodes belong to the parts, the weight and the bias.

@@ -20,7 +20,7 @@ use demc_kernels::{Isa, batch_norm, blend, filter, pool};
 
 use super::forward::{fuse, rel_mse_into};
 use super::{KernelOps, buffer, contiguous, dims, grid, maps, tensor, values};
-use convolution::{Conv3x3, ConvState, Deconv4x4, Fuse};
+use convolution::{Conv3x3, Conv5x5, ConvState, Deconv4x4, Fuse};
 
 type Tracked = FloatTensor<Autodiff<Flex>>;
 
@@ -36,23 +36,15 @@ impl<C: CheckpointStrategy> KernelOps for Autodiff<Flex, C> {
     }
 
     fn conv3x3(x: Tracked, weight: Tracked, bias: Tracked, relu: bool) -> Tracked {
-        let ([x, weight, bias], nodes) = parts([x, weight, bias]);
-        let y = Flex::conv3x3(x.clone(), weight.clone(), bias, relu);
-        record::<_, C, _>(Conv3x3, nodes, y, |y| ConvState {
-            inputs: [x],
-            weight,
-            y: relu.then(|| y.clone()),
-        })
+        convolution::<C>(Conv3x3, Flex::conv3x3, [x, weight, bias], relu)
+    }
+
+    fn conv5x5(x: Tracked, weight: Tracked, bias: Tracked, relu: bool) -> Tracked {
+        convolution::<C>(Conv5x5, Flex::conv5x5, [x, weight, bias], relu)
     }
 
     fn deconv4x4(x: Tracked, weight: Tracked, bias: Tracked, relu: bool) -> Tracked {
-        let ([x, weight, bias], nodes) = parts([x, weight, bias]);
-        let y = Flex::deconv4x4(x.clone(), weight.clone(), bias, relu);
-        record::<_, C, _>(Deconv4x4, nodes, y, |y| ConvState {
-            inputs: [x],
-            weight,
-            y: relu.then(|| y.clone()),
-        })
+        convolution::<C>(Deconv4x4, Flex::deconv4x4, [x, weight, bias], relu)
     }
 
     fn fuse_one(a: Tracked, weight: Tracked, bias: Tracked, relu: bool) -> Tracked {
@@ -86,11 +78,11 @@ impl<C: CheckpointStrategy> KernelOps for Autodiff<Flex, C> {
         <Self as AutodiffBackend>::from_inner(Flex::halve(x.into_primitive()))
     }
 
-    fn filter5x5(x: Tracked, logits: Tracked) -> Tracked {
+    fn filter(x: Tracked, logits: Tracked) -> Tracked {
         let x = contiguous(x.into_primitive());
         let ([logits], nodes) = parts([logits]);
-        let y = Flex::filter5x5(x.clone(), logits.clone());
-        record::<_, C, _>(Filter5x5, nodes, y, |_| [x, logits])
+        let y = Flex::filter(x.clone(), logits.clone());
+        record::<_, C, _>(FilterPixels, nodes, y, |_| [x, logits])
     }
 
     fn blend(filtered: Tracked, coarse: Tracked) -> Tracked {
@@ -176,6 +168,22 @@ where
     }
 }
 
+/// Runs a convolution on maps, weight, and bias, and records `backward`.
+fn convolution<C: CheckpointStrategy>(
+    backward: impl Backward<Flex, 3, State = ConvState<1>>,
+    forward: fn(FlexTensor, FlexTensor, FlexTensor, bool) -> FlexTensor,
+    operands: [Tracked; 3],
+    relu: bool,
+) -> Tracked {
+    let ([x, weight, bias], nodes) = parts(operands);
+    let y = forward(x.clone(), weight.clone(), bias, relu);
+    record::<_, C, _>(backward, nodes, y, |y| ConvState {
+        inputs: [x],
+        weight,
+        y: relu.then(|| y.clone()),
+    })
+}
+
 fn fuse_recorded<C: CheckpointStrategy, const P: usize, const N: usize>(
     inputs: [FlexTensor; P],
     weight: FlexTensor,
@@ -210,9 +218,9 @@ impl Backward<Flex, 1> for MaxPool {
 }
 
 #[derive(Debug)]
-struct Filter5x5;
+struct FilterPixels;
 
-impl Backward<Flex, 1> for Filter5x5 {
+impl Backward<Flex, 1> for FilterPixels {
     /// The image and the logits.
     type State = [FlexTensor; 2];
 
