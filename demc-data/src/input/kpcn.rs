@@ -4,38 +4,16 @@
 //! follow: that of `f(x)` is `f'(x)^2` times that of `x`. A variance of three channels becomes that of
 //! their luminance, as if they were independent.
 
-use crate::image::frame::{FEATURES, MAX_ALBEDO, TEXTURES};
-use crate::image::plane::Plane;
+use crate::image::frame::{DEPTH, FEATURES, MAX_ALBEDO, TEXTURES};
 use crate::input::ranges::LUMINANCE;
+
+pub use crate::image::frame::{LIGHT, PASS_PLANES, PASSES, REFERENCE_PASSES};
 
 /// Added to the albedo before diffuse light is divided by it.
 const ALBEDO_EPSILON: f32 = 0.00316;
 
-/// The passes: content in a [layout](crate::image::layout), and number of planes.
-pub const PASSES: [(&str, usize); 8] = [
-    ("diffuse", 3),
-    ("specular", 3),
-    ("depth", 1),
-    ("variance of diffuse", 3),
-    ("variance of specular", 3),
-    ("variance of normal", 3),
-    ("variance of texture1", 3),
-    ("variance of depth", 1),
-];
-
-/// Planes of all [`PASSES`].
-pub const PASS_PLANES: usize = 20;
-
-/// The passes that training needs beside them.
-pub const REFERENCE_PASSES: [(&str, usize); 2] =
-    [("reference_diffuse", 3), ("reference_specular", 3)];
-
-/// Planes of both parts of the light.
-pub const LIGHT: usize = 6;
-
-/// Index of the depth and of the first variances.
-const DEPTH: usize = 6;
-const VARIANCES: usize = 7;
+/// Index of the first variances among the passes.
+const VARIANCES: usize = DEPTH + 1;
 
 /// The planes that the network takes as input.
 #[derive(Debug, Clone, PartialEq)]
@@ -91,16 +69,6 @@ impl KpcnInput {
             features: planes,
             divisor,
         }
-    }
-}
-
-/// Divides the depth of a whole image by its largest value, and its variance by the square of that.
-pub(crate) fn normalise_depth(passes: &mut [Plane]) {
-    let largest = passes[DEPTH].max();
-    let depths = [(DEPTH, largest), (PASS_PLANES - 1, largest * largest)];
-    for (index, divisor) in depths.into_iter().filter(|(_, divisor)| *divisor > 0.0) {
-        let values = passes[index].to_f32().into_iter();
-        passes[index] = Plane::Float(values.map(|value| value / divisor).collect());
     }
 }
 

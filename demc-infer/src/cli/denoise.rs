@@ -334,22 +334,17 @@ impl Arguments {
             let error = described(&error);
             progress.line(format_args!("note: {name}: {error}"));
         }
-        let image = &denoised.color_hdr;
-        EnergyBias::of(&frame, image)
-            .warning()
-            .iter()
-            .for_each(warn);
+        let bias = EnergyBias::of(&frame, &denoised.color_hdr);
+        bias.warning().iter().for_each(warn);
         let mut planes = denoised.color_hdr;
         // Alpha that is not denoised stays as it is in the file, unless it was repaired.
         let repaired_alpha = || frame.alpha.clone().filter(|_| repaired > 0);
         planes.extend(denoised.alpha.or_else(repaired_alpha).into_iter().flatten());
         planes.extend(denoised.layers);
-        let mut added = DETAIL.as_slice();
-        if self.detail_map {
-            planes.extend(bundle.detail_map(&frame)?.into_iter().flatten());
-        } else {
-            added = &[];
-        }
+        let detail = self.detail_map.then(|| bundle.detail_map(&frame));
+        let detail = detail.transpose()?.flatten();
+        let added = if detail.is_some() { &DETAIL[..] } else { &[] };
+        planes.extend(detail.into_iter().flatten());
         let replaced = Replaced {
             layout,
             layers: &names,

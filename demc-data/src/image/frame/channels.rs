@@ -4,11 +4,11 @@ use std::io::{Read, Seek};
 use std::path::Path;
 
 use super::buffers::{FEATURES, POSITIONS, Presence, TEXTURES};
+use super::light::{PASSES, REFERENCE_PASSES, pass_channels};
 use crate::error::Error;
 use crate::image::channel::Window;
 use crate::image::exr::ExrFile;
 use crate::image::layout::{ChannelLayout, InputKind, Missing, Triple};
-use crate::input::kpcn;
 
 /// The channels of a frame; `None` stands for zeros.
 pub(super) struct FrameChannels<'a> {
@@ -77,9 +77,9 @@ impl<'a> FrameChannels<'a> {
             }
         };
         let wanted = Self {
-            passes: passes(&kpcn::PASSES)?,
+            passes: passes(&PASSES)?,
             reference_passes: match &reference {
-                Some(_) => passes(&kpcn::REFERENCE_PASSES)?,
+                Some(_) => passes(&REFERENCE_PASSES)?,
                 None => Vec::new(),
             },
             color: slots(&layout.color),
@@ -132,34 +132,6 @@ impl<'a> FrameChannels<'a> {
             }),
         }
     }
-}
-
-/// The channels of each pass, by its [content](crate::image::layout::NamedBuffer::content).
-///
-/// # Errors
-/// [`Error::MissingPasses`] for passes that the layout does not name or the file lacks.
-pub(super) fn pass_channels<'a, R: Read + Seek>(
-    file: &ExrFile<R>,
-    layout: &ChannelLayout,
-    contents: impl Iterator<Item = &'a str>,
-) -> Result<Vec<Vec<String>>, Error> {
-    let named = layout.buffers();
-    let (mut channels, mut missing) = (Vec::new(), Vec::new());
-    for content in contents {
-        match named.iter().find(|buffer| buffer.content == content) {
-            Some(buffer) => channels.push(buffer.channels.clone()),
-            None => missing.push(content.to_owned()),
-        }
-    }
-    let names = channels.iter().flatten();
-    missing.extend(names.filter(|name| file.channel(name).is_none()).cloned());
-    if missing.is_empty() {
-        return Ok(channels);
-    }
-    Err(Error::MissingPasses {
-        path: file.path().to_owned(),
-        missing,
-    })
 }
 
 fn slots(names: &Triple) -> Vec<Option<&str>> {

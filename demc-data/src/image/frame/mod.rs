@@ -5,12 +5,15 @@
 mod buffers;
 mod channels;
 pub mod layers;
+mod light;
 mod passes;
 mod read;
 
 pub use buffers::{
     FEATURE_NAMES, FEATURES, Frame, FramePlanes, MAX_ALBEDO, POSITIONS, Presence, TEXTURES,
 };
+pub(crate) use light::DEPTH;
+pub use light::{LIGHT, PASS_PLANES, PASSES, REFERENCE_PASSES};
 pub use passes::{PassPlanes, decode_passes};
 pub use read::{
     check_header, check_open_header, decode_input, decode_repaired, read_frame, read_input,

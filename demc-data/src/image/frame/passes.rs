@@ -2,7 +2,7 @@
 
 use std::io::{Read, Seek};
 
-use super::channels::pass_channels;
+use super::light::pass_channels;
 use super::read::finite;
 use crate::error::Error;
 use crate::image::exr::ExrFile;

@@ -7,12 +7,12 @@ use demc_program::parallel;
 
 use super::buffers::{Frame, FramePlanes, Presence};
 use super::channels::FrameChannels;
+use super::light::{LIGHT, normalise_depth};
 use crate::error::Error;
 use crate::image::channel::Window;
 use crate::image::exr::ExrFile;
 use crate::image::layout::ChannelLayout;
 use crate::image::plane::{NonFiniteSamples, Plane, clear_infinite};
-use crate::input::kpcn;
 
 /// Reads and checks an image. Reference and mask are read if present.
 ///
@@ -189,11 +189,11 @@ impl FramePlanes {
             .color
             .iter_mut()
             .chain(planes.reference.iter_mut().flatten())
-            .chain(passes.take(kpcn::LIGHT))
+            .chain(passes.take(LIGHT))
             .chain(planes.reference_passes.iter_mut().flatten());
         planes.clamped = radiance.map(Plane::clamp_negative).sum();
         if let Some(passes) = &mut planes.passes {
-            kpcn::normalise_depth(passes);
+            normalise_depth(passes);
         }
         Ok((planes, repaired))
     }

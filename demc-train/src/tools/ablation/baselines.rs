@@ -10,10 +10,9 @@ use demc_infer::baseline;
 use demc_infer::evaluate::ImageScore;
 use demc_infer::nfor;
 use demc_program::checksum::{sha256, sha256_of};
-use serde::Deserialize;
 
 use super::results::{self, ImageValue, RESULTS, ScoredRun};
-use super::spec::AblationSpec;
+use super::spec::{AblationSpec, Baseline};
 use super::{DataFiles, values_of};
 use crate::config::HASH_DIGITS;
 use crate::record::progress::say;
@@ -22,16 +21,6 @@ use crate::record::progress::say;
 const NOISY: &str = "noisy";
 /// The value of `images` that stands for NFOR.
 const NFOR: &str = "nfor";
-
-/// A method without training.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Baseline {
-    /// Its name in tables.
-    pub name: String,
-    /// `noisy`; `nfor`, which is computed; or a directory with an EXR file per test scene.
-    images: String,
-}
 
 /// The scores of all baselines, once for each seed. Those in `results.csv` are taken from there if data
 /// and images are the same; others are computed and added to it. A missing directory is left out, with

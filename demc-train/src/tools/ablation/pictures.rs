@@ -23,8 +23,8 @@ pub(super) fn files(spec: &AblationSpec) -> Vec<PathBuf> {
     names.map(|scene| path(spec, scene)).collect()
 }
 
-/// Writes a picture of each scene of the list that lacks one: from left to right the baselines, each
-/// variant from the first seed after its detail map, and the reference.
+/// Writes a picture of each scene of the list that lacks one. From left to right there are the
+/// baselines, each variant from the first seed after its detail map, and the reference.
 ///
 /// # Errors
 /// A scene that is not in the test split; a run whose weights are gone; a file that cannot be written.

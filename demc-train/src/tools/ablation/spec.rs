@@ -17,7 +17,6 @@ use demc_model::{ModelConfig, Variant};
 use demc_program::file::{MAX_CONFIGURATION, read_text};
 use serde::Deserialize;
 
-use super::baselines::Baseline;
 use crate::config::{Config, ConfigError, one_line};
 
 /// The key that `seeds` sets.
@@ -48,6 +47,16 @@ struct AblationFile {
     /// Test scenes of which a picture is made.
     #[serde(default)]
     pictures: Vec<String>,
+}
+
+/// A method without training.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Baseline {
+    /// Its name in tables.
+    pub name: String,
+    /// `noisy`; `nfor`, which is computed; or a directory with an EXR file per test scene.
+    pub images: String,
 }
 
 #[derive(Clone, Debug, Deserialize)]
