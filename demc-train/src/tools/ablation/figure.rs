@@ -6,8 +6,10 @@ use crate::tools::chart::figure::{AxisScale, Category, CategoryFigure, CategoryP
 
 use super::comparison::{Comparison, MetricScores, VariantScores};
 
+type ScoresOf = fn(&VariantScores) -> Option<&MetricScores>;
+
 /// The metrics of the charts.
-const METRICS: [(&str, fn(&VariantScores) -> Option<&MetricScores>); 2] = [
+const METRICS: [(&str, ScoresOf); 2] = [
     ("RelMSE", |row| Some(&row.relmse)),
     ("SSIM", |row| row.ssim.as_ref()),
 ];
