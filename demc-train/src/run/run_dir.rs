@@ -89,10 +89,13 @@ impl RunDir {
             return Ok(dir);
         };
         let saved = dir.saved_config()?;
-        if resume && saved.is_none() {
+        if resume
+            && saved.is_none()
+            && !matches!(read_record(&path.join(RUN))?, StoredRecord::Intact(_))
+        {
             bail!(
-                "{}: has {trace}, but neither {CONFIG} nor a checkpoint of a run; move the file, or name another \
-                 directory with --run-dir",
+                "{}: has {trace}, but no configuration, record, or checkpoint of a run; move the file, or name \
+                 another directory with --run-dir",
                 path.display()
             );
         }

@@ -95,7 +95,7 @@ fn a_resume_keeps_files_of_another_program() {
         }
         let error = error_line(&train(&config, &run, &["--resume"]), 1);
         assert!(
-            error.contains("neither config.toml nor a checkpoint"),
+            error.contains("but no configuration, record, or checkpoint"),
             "{error}"
         );
         for (name, text) in &theirs[..count] {
