@@ -24,8 +24,8 @@ pub struct LossConfig {
     pub l1: f32,
     /// Weight of the mean absolute error in linear HDR (Bako et al. 2017).
     pub l1_hdr: f32,
-    /// Share of the steps, at the start, in which each network of KPCN has its own loss instead: the
-    /// mean absolute error in its space (Bako et al. 2017). 0 for other variants.
+    /// Share of the steps, at the start, in which each network of KPCN has its own loss instead. That
+    /// is the mean absolute error in its space (Bako et al. 2017). 0 for other variants.
     pub separate: f32,
     /// Epsilon of RelMSE (Eq. 5).
     pub relmse_epsilon: f32,

@@ -6,6 +6,8 @@ mod batches;
 mod cli;
 #[cfg(feature = "cli")]
 mod cli_datasets;
+#[cfg(feature = "cli")]
+mod cli_index;
 mod datasets;
 mod doctor;
 mod fuzz_inputs;

@@ -1,5 +1,5 @@
-//! A network ready to denoise, and its albedo filter: a second network in the same file, which
-//! denoises the first hit's albedo before the main network sees it ([`crate::denoise`]).
+//! A network ready to denoise, and its albedo filter. The filter is a second network in the same file;
+//! it denoises the first hit's albedo before the main network sees it ([`crate::denoise`]).
 
 use demc_data::image::layout::{Missing, MissingPolicies};
 use demc_model::Denoiser;

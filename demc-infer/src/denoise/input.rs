@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_data::image::frame::TEXTURES;
+use demc_data::input::kpcn::{KpcnInput, LIGHT, radiance_from_light};
 use demc_data::input::transform::exposure_scale;
 use demc_data::{FEATURES, Frame, PositionMap};
 use demc_model::Head;
@@ -260,6 +261,32 @@ impl<'a> FrameInput<'a> {
         Ok(out)
     }
 
+    /// As [`tile`](Self::tile), for KPCN: `forward` takes light and features.
+    ///
+    /// # Shapes
+    /// Returns `[3, rows, columns]` in linear HDR.
+    ///
+    /// # Errors
+    /// A frame without passes; those of `forward`.
+    fn light_tile(
+        &self,
+        [rows, columns]: [&PixelRange; 2],
+        forward: impl FnMut([Tensor<4>; 2]) -> Result<Tensor<4>, DenoiseError>,
+    ) -> Result<Vec<f32>, DenoiseError> {
+        let Some(passes) = &self.frame.passes else {
+            let name = self.frame.name.clone();
+            return Err(DenoiseError::NoPasses { name });
+        };
+        let cut = |planes: &[f32]| self.padding.cut(planes, rows.clone(), columns.clone());
+        let input = KpcnInput::new(&cut(passes), &cut(&self.frame.features), self.scale);
+        let inputs = [
+            self.tensor::<LIGHT>(input.light, rows, columns),
+            self.tensor::<FEATURES>(input.features, rows, columns),
+        ];
+        let light = self.read(self.ensemble.mean(inputs, forward)?)?;
+        Ok(radiance_from_light(&light, &input.divisor, self.scale))
+    }
+
     /// The [modulation](demc_data::Normalizer::modulation) and the Z-scored features of a tile. A
     /// network without features gets zeros.
     fn modulation_and_features(
@@ -307,7 +334,7 @@ impl<'a> FrameInput<'a> {
         self.tensor::<FEATURES>(planes, &rows, &columns)
     }
 
-    pub(super) fn tensor<const CHANNELS: usize>(
+    fn tensor<const CHANNELS: usize>(
         &self,
         planes: Vec<f32>,
         rows: &PixelRange,

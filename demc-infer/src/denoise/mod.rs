@@ -5,7 +5,6 @@ mod albedo;
 #[cfg(test)]
 mod filter_tests;
 mod input;
-mod kpcn;
 #[cfg(test)]
 mod kpcn_tests;
 mod layers;

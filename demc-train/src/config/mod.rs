@@ -282,9 +282,9 @@ impl Config {
         (self.data.batch_size * self.train.grad_accumulation) as u64
     }
 
-    /// The first 16 digits of the SHA-256 of the keys that change numbers of the run (see
-    /// [`differences`](Self::differences)) and of `data`, the text of the
-    /// [contents](crate::run::data::DataContents) of the data set.
+    /// The first 16 digits of the SHA-256 of the keys that change numbers of the run
+    /// ([`differences`](Self::differences)) and of `data`. That is the text of the data set's
+    /// [contents](crate::run::data::DataContents).
     pub fn hash(&self, data: &str) -> String {
         let keys = self.relevant();
         let keys = keys.iter().map(|(key, value)| format!("{key} = {value}\n"));
