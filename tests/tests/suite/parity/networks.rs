@@ -16,11 +16,11 @@ use crate::tensors::{Tolerance, assert_close};
 const STEPS: usize = 5;
 const LEARNING_RATE: f64 = 1e-3;
 
-/// 2 % of the path of a weight whose gradient keeps its sign, one learning rate per step. Adam
+/// 6 % of the path of a weight whose gradient keeps its sign, one learning rate per step. Adam
 /// divides by the size of the gradient, so rounding errors of the smallest gradients keep their
-/// relative size.
+/// relative size. Measured: 1.5e-4 (`wgpu` on llvmpipe, AVX-512).
 const ADAM: Tolerance = Tolerance {
-    absolute: 1e-4,
+    absolute: 3e-4,
     of_largest: 0.0,
     of_value: 0.0,
 };
@@ -45,7 +45,7 @@ const WANDERING_BIAS: Tolerance = Tolerance {
 /// The running mean contains that bias: 0.01 of 0 + 1 + 2 + 3 + 4 learning rates, plus the
 /// tolerance of other weights.
 const RUNNING_MEAN: Tolerance = Tolerance {
-    absolute: 1e-4 + 1e-4,
+    absolute: 1e-4 + 3e-4,
     of_largest: 0.0,
     of_value: 0.0,
 };
