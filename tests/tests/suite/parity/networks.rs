@@ -16,13 +16,19 @@ use crate::tensors::{Tolerance, assert_close};
 const STEPS: usize = 5;
 const LEARNING_RATE: f64 = 1e-3;
 
-/// 6 % of the path of a weight whose gradient keeps its sign, one learning rate per step. Adam
+/// 2 % of the path of a weight whose gradient keeps its sign, one learning rate per step. Adam
 /// divides by the size of the gradient, so rounding errors of the smallest gradients keep their
-/// relative size. Measured: 1.5e-4 (`wgpu` on llvmpipe, AVX-512).
+/// relative size.
 const ADAM: Tolerance = Tolerance {
-    absolute: 3e-4,
+    absolute: 1e-4,
     of_largest: 0.0,
     of_value: 0.0,
+};
+
+/// Looser than [`ADAM`], which `flex` meets. Measured: 1.5e-4 (`wgpu` on llvmpipe, AVX-512).
+const ADAM_ON_OTHER_DEVICES: Tolerance = Tolerance {
+    absolute: 3e-4,
+    ..ADAM
 };
 
 /// Looser than [`ADAM`], which Burn's operations meet. Some weights on the deepest maps of 2x2
@@ -45,7 +51,7 @@ const WANDERING_BIAS: Tolerance = Tolerance {
 /// The running mean contains that bias: 0.01 of 0 + 1 + 2 + 3 + 4 learning rates, plus the
 /// tolerance of other weights.
 const RUNNING_MEAN: Tolerance = Tolerance {
-    absolute: 1e-4 + 3e-4,
+    absolute: 1e-4 + 1e-4,
     of_largest: 0.0,
     of_value: 0.0,
 };
@@ -249,9 +255,12 @@ fn check_adam(
         .collect();
     let expected = fixture.group("adam/");
     assert_eq!(found.len(), expected.len(), "number of weights");
-    let adam_tolerance = match model.ops().on(&super::device()) {
+    let device = super::device();
+    let adam_tolerance = match model.ops().on(&device) {
         Ops::Kernels => ADAM_ON_KERNELS,
-        Ops::Burn => ADAM,
+        // Only `flex` has kernels.
+        Ops::Burn if Ops::Kernels.on(&device) == Ops::Kernels => ADAM,
+        Ops::Burn => ADAM_ON_OTHER_DEVICES,
     };
     let [mut worst, mut worst_mean] = [0.0f32; 2];
     for weight in expected {
