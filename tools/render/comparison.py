@@ -1,4 +1,4 @@
-"""Rooms and still lifes of the paper's comparison (`--preset comparison-train` and `comparison-test`).
+"""Rooms and still lifes of the paper's comparison (`--preset comparison`).
 
 Neither the training nor the held-out scenes of the bundled models draw their furniture, textures,
 pictures, and lights. The rest is shared: plain materials, the shape of rooms, and the cameras.
