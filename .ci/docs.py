@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 # CI runs the blocks of these pages.
 PAGES = ["README.md", *(f"docs/{page}.md" for page in (
-    "training", "configuration", "data", "denoising", "farms", "clusters", "renderers", "evaluation", "export", "devices", "performance", "network",
+    "training", "configuration", "data", "denoising", "farms", "clusters", "renderers", "evaluation", "export", "oidn", "devices", "performance", "network",
     "conclusions", "install", "python", "c-library", "dependencies")), "bindings/python/README.md", "models/README.md", "bindings/blender/README.md"]
 NAME = re.compile(r"<!-- ci: ([a-z0-9-]+) -->")
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)(?:\s+\"[^\"]*\")?\)")

@@ -55,6 +55,7 @@ pub fn network(width: usize) -> Bundle {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
         position: PositionSpace::Scene,
+        transfer: demc_data::Transfer::Gamma,
         exposure_level: None,
         restore_light: false,
         features: FeatureStats {

@@ -43,6 +43,7 @@ pub use image::rgb::{Rgb, read_rgb};
 pub use input::position::{PositionMap, PositionSpace};
 pub use input::preparation::Preparation;
 pub use input::ranges::{FrameSummary, Ranges};
+pub use input::transfer::Transfer;
 pub use input::transform::{FeatureStats, Normalizer};
 pub use training::augment::Augment;
 pub use training::batch::{Batch, PatchSource};

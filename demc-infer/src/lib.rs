@@ -39,6 +39,7 @@
 //! - [`guard`]: compares an image with the training data, then refuses it or warns.
 //! - [`onnx`]: exports the network for other runtimes. [`verify`](mod@verify) compares their output
 //!   with this crate's.
+//! - [`tza`]: weights of Open Image Denoise, to start from and to export.
 //! - [`evaluate`]: scores against a reference, with [`baseline`]s and [`statistics`]. `report`
 //!   (feature `cli`) makes an HTML page of them, [`picture`] makes 8-bit pictures.
 //! - [`device`], [`compute`]: the device, its operations and instruction set.
@@ -69,6 +70,7 @@ pub mod picture;
 pub mod report;
 pub mod statistics;
 pub mod tiles;
+pub mod tza;
 pub mod verify;
 
 pub use baseline::{Baseline, BaselineError};

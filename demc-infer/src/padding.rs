@@ -1,12 +1,10 @@
-//! Pads images to multiples of 32 and crops them back. The network halves the resolution five times
-//! (Fig. 3), so both sides must be multiples of 2^5 ([`DOWNSAMPLING`]).
+//! Pads images and crops them back. The paper's network halves the resolution five times (Fig. 3), so both
+//! sides must be multiples of 2^5.
 //!
 //! The last column and row are repeated to the right and downwards. This creates no edge that the
 //! network could mistake for one in the scene (ours: the paper's sizes are multiples).
 
 use std::ops::Range;
-
-use demc_model::DOWNSAMPLING;
 
 use crate::tiles::Span;
 
@@ -20,17 +18,19 @@ pub struct Padding {
     pub height: usize,
     /// Width of the image.
     pub width: usize,
+    /// The padded sides are multiples of this.
+    pub unit: usize,
 }
 
 impl Padding {
-    /// Height after padding: the next multiple of [`DOWNSAMPLING`].
+    /// Height after padding: the next multiple of the unit.
     pub fn padded_height(&self) -> usize {
-        self.height.next_multiple_of(DOWNSAMPLING)
+        self.height.next_multiple_of(self.unit)
     }
 
-    /// Width after padding: the next multiple of [`DOWNSAMPLING`].
+    /// Width after padding: the next multiple of the unit.
     pub fn padded_width(&self) -> usize {
-        self.width.next_multiple_of(DOWNSAMPLING)
+        self.width.next_multiple_of(self.unit)
     }
 
     /// Pads every plane by edge replication.
@@ -52,7 +52,7 @@ impl Padding {
     /// # Panics
     /// If `planes` does not hold whole planes of at least one pixel.
     pub fn cut(&self, planes: &[f32], rows: Range<usize>, columns: Range<usize>) -> Vec<f32> {
-        let Self { height, width } = *self;
+        let Self { height, width, .. } = *self;
         assert!(height > 0 && width > 0 && planes.len().is_multiple_of(height * width));
         let channels = planes.len() / (height * width);
         let inside = columns.start.min(width)..columns.end.min(width);
@@ -73,7 +73,7 @@ impl Padding {
     /// # Shapes
     /// `tile` is `[C, rows.read, columns.read]`, `planes` `[C, H, W]`.
     pub fn paste(&self, tile: &[f32], rows: &Span, columns: &Span, planes: &mut [f32]) {
-        let Self { height, width } = *self;
+        let Self { height, width, .. } = *self;
         let (tall, wide) = (rows.read.len(), columns.read.len());
         let kept = columns.core.start..columns.core.end.min(width);
         let tiles = tile.chunks_exact(tall * wide);
@@ -113,6 +113,7 @@ mod tests {
         let padding = Padding {
             height: 32,
             width: 64,
+            unit: 32,
         };
         let planes = pattern(3, 32, 64);
         assert_eq!(padding.pad(&planes), planes);
@@ -122,7 +123,11 @@ mod tests {
     #[test]
     fn crop_undoes_pad_for_odd_sizes() {
         for (height, width) in [(1, 1), (33, 31), (5, 100), (224, 1)] {
-            let padding = Padding { height, width };
+            let padding = Padding {
+                height,
+                width,
+                unit: 32,
+            };
             let planes = pattern(3, height, width);
             let padded = padding.pad(&planes);
             assert_eq!(
@@ -138,6 +143,7 @@ mod tests {
         let padding = Padding {
             height: 2,
             width: 3,
+            unit: 32,
         };
         let padded = padding.pad(&[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
         assert_eq!(&padded[..6], &[1.0, 2.0, 3.0, 3.0, 3.0, 3.0]);
@@ -150,6 +156,7 @@ mod tests {
         let padding = Padding {
             height: 40,
             width: 50,
+            unit: 32,
         };
         let planes = pattern(2, 40, 50);
         let padded = padding.pad(&planes);
@@ -167,7 +174,11 @@ mod tests {
     #[test]
     fn tiles_cut_and_pasted_give_the_image() {
         let (height, width) = (70, 100);
-        let padding = Padding { height, width };
+        let padding = Padding {
+            height,
+            width,
+            unit: 32,
+        };
         let planes = pattern(3, height, width);
         let span = |core: Range<usize>, end: usize| Span {
             read: core.start.saturating_sub(32)..(core.end + 32).min(end),

@@ -72,7 +72,8 @@ pub struct Tiles {
     pub columns: Vec<Span>,
 }
 
-/// One tile's range on an axis, in pixels. Both ranges start and end on multiples of 32.
+/// One tile's range on an axis, in pixels. Both ranges start and end on multiples of 32, or at the image's
+/// end.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Span {
     /// The pixels that the tile outputs. The cores of an axis are adjacent.
@@ -82,8 +83,7 @@ pub struct Span {
 }
 
 impl Tiles {
-    /// The grid with the fewest computed pixels for a padded image of `height` x `width` pixels
-    /// (multiples of 32).
+    /// The grid with the fewest computed pixels for a padded image of `height` x `width` pixels.
     ///
     /// `need` returns the bytes of a tile of a height and a width. No tile needs more than
     /// `available` bytes; `None` is no limit.
@@ -102,10 +102,10 @@ impl Tiles {
         };
         let axis = |length: usize| -> Vec<AxisCut> {
             let side = tiling.side.unwrap_or(length).max(DOWNSAMPLING);
-            let blocks = length / DOWNSAMPLING;
+            let blocks = length.div_ceil(DOWNSAMPLING);
             let fewest = blocks.div_ceil(side / DOWNSAMPLING);
             (fewest..=blocks)
-                .map(|count| AxisCut::new(blocks, count, halo))
+                .map(|count| AxisCut::new(length, count, halo))
                 .collect()
         };
         let (rows, columns) = (axis(height), axis(width));
@@ -115,9 +115,7 @@ impl Tiles {
             Some((rows, columns))
         });
         let best = fitting.min_by_key(|(rows, columns)| rows.total * columns.total);
-        let cut = |length: usize, axis: &AxisCut| {
-            spans(length / DOWNSAMPLING, axis.count, halo).collect()
-        };
+        let cut = |length: usize, axis: &AxisCut| spans(length, axis.count, halo).collect();
         best.map(|(rows, columns)| Self {
             rows: cut(height, rows),
             columns: cut(width, columns),
@@ -175,8 +173,8 @@ struct AxisCut {
 }
 
 impl AxisCut {
-    fn new(blocks: usize, count: usize, halo: usize) -> Self {
-        let lengths = || spans(blocks, count, halo).map(|span| span.read.len());
+    fn new(length: usize, count: usize, halo: usize) -> Self {
+        let lengths = || spans(length, count, halo).map(|span| span.read.len());
         Self {
             count,
             longest: lengths().max().unwrap_or(0),
@@ -185,12 +183,13 @@ impl AxisCut {
     }
 }
 
-/// Cuts an axis of `blocks` times 32 pixels into `count` spans of nearly equal length.
-fn spans(blocks: usize, count: usize, halo: usize) -> impl Iterator<Item = Span> {
-    let edge = move |i: usize| i * blocks / count * DOWNSAMPLING;
+/// Cuts an axis of `length` pixels into `count` spans of nearly equal length, at multiples of 32.
+fn spans(length: usize, count: usize, halo: usize) -> impl Iterator<Item = Span> {
+    let blocks = length.div_ceil(DOWNSAMPLING);
+    let edge = move |i: usize| (i * blocks / count * DOWNSAMPLING).min(length);
     (0..count).map(move |i| Span {
         core: edge(i)..edge(i + 1),
-        read: edge(i).saturating_sub(halo)..(edge(i + 1) + halo).min(blocks * DOWNSAMPLING),
+        read: edge(i).saturating_sub(halo)..(edge(i + 1) + halo).min(length),
     })
 }
 
@@ -248,6 +247,17 @@ mod tests {
         }
     }
 
+    /// A U-Net's sides are multiples of 16.
+    #[test]
+    fn the_last_tile_may_end_between_two_blocks() {
+        let (height, width) = (1088 + 16, 1920);
+        let tiles = plan((height, width), Tiling::default(), 700 * 700).expect("416 x 416 fits");
+        let last = tiles.rows.last().expect("a row");
+        assert_eq!((last.core.end, last.read.end), (height, height));
+        assert!(tiles.rows.iter().all(|span| span.core.start % 32 == 0));
+        assert_eq!(tiles.image_pixels(), (height * width) as u64);
+    }
+
     #[test]
     fn no_grid_that_fits_computes_less() {
         let (height, width, available) = (736, 1280, 900 * 700);
@@ -255,8 +265,8 @@ mod tests {
         for rows in 1..=height / 32 {
             for columns in 1..=width / 32 {
                 let other = Tiles {
-                    rows: spans(height / 32, rows, EXACT_HALO).collect(),
-                    columns: spans(width / 32, columns, EXACT_HALO).collect(),
+                    rows: spans(height, rows, EXACT_HALO).collect(),
+                    columns: spans(width, columns, EXACT_HALO).collect(),
                 };
                 let (tall, wide) = other.largest();
                 let fits = (tall * wide) as u64 <= available;

@@ -18,6 +18,7 @@ pub mod conv1x1;
 pub mod conv3x3;
 pub mod conv5x5;
 pub mod deconv4x4;
+pub mod double;
 pub mod filter;
 pub mod grid;
 pub mod isa;

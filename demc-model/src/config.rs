@@ -1,4 +1,5 @@
-//! The `[model]` table, the variants (Sec. 3, 4.3, 4.4), the readings of the paper, and KPCN.
+//! The `[model]` table, the variants (Sec. 3, 4.3, 4.4), the readings of the paper, and networks of
+//! others.
 //!
 //! All differences between networks are in [`VariantSpec`] and [`ReadingSpec`]. The modules read
 //! these tables and do not branch on names. A new variant is a new row.
@@ -7,10 +8,13 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use crate::unet_size::{Guides, UNET_LEVELS, UnetSize};
+
 /// Levels of an encoder and of the decoder (Sec. 3.2: "five down-sampling units").
 pub const LEVELS: usize = 5;
 
-/// Factor between the input's and the latent's height and width: 2^5.
+/// Factor between the input's and the latent's height and width of the paper's networks: 2^5. The largest
+/// of all variants.
 pub const DOWNSAMPLING: usize = 1 << LEVELS;
 
 /// The paper's channels of each level as multiples of the base width, from the full resolution down
@@ -49,6 +53,8 @@ pub enum Variant {
     ColorOnly,
     /// The kernel-predicting networks that the paper compares with ([`crate::kpcn`]).
     Kpcn,
+    /// The U-Net of Open Image Denoise ([`crate::unet`]).
+    Unet,
 }
 
 /// The reading of the paper where its text and the authors' released model differ.
@@ -146,10 +152,16 @@ pub struct VariantSpec {
     pub name: &'static str,
     /// The inputs of each encoder, concatenated over channels in this order. The skips enter the
     /// fusion in the order of the encoders (Eq. 2: features, then HDR). The last encoder feeds the
-    /// latent. None: the variant is KPCN.
+    /// latent. None: the variant has another body.
     pub encoders: &'static [&'static [Input]],
     /// Channels of the colour at input and output: one image, or two for KPCN.
     pub color_channels: usize,
+    /// Times that the network halves the resolution: the sides of its input are multiples of 2 to this
+    /// power. The convolutions of KPCN could take any size.
+    pub halvings: usize,
+    /// Whether an image of another size gets zeros at its right and bottom, as in OIDN; otherwise its
+    /// last pixels are repeated.
+    pub pads_with_zeros: bool,
 }
 
 impl VariantSpec {
@@ -185,20 +197,21 @@ pub struct ReadingSpec {
 }
 
 impl Variant {
-    /// All variants: those of the paper in its order, the control, and KPCN.
-    pub const ALL: [Variant; 5] = [
+    /// All variants: those of the paper in its order, the control, KPCN, and the U-Net.
+    pub const ALL: [Variant; 6] = [
         Variant::Demc,
         Variant::DemcNosn,
         Variant::Semc,
         Variant::ColorOnly,
         Variant::Kpcn,
+        Variant::Unet,
     ];
 
-    /// The variants that have encoders and a decoder: all but KPCN.
+    /// The variants that are a [`crate::dual_encoder::DualEncoder`].
     pub fn with_encoders() -> impl Iterator<Item = Variant> {
         Self::ALL
             .into_iter()
-            .filter(|variant| *variant != Variant::Kpcn)
+            .filter(|variant| !variant.spec().encoders.is_empty())
     }
 
     /// The table of variants.
@@ -208,26 +221,43 @@ impl Variant {
                 name: "demc",
                 encoders: &[&[Input::DetailMap], &[Input::Color]],
                 color_channels: COLOR_CHANNELS,
+                halvings: LEVELS,
+                pads_with_zeros: false,
             },
             Variant::DemcNosn => &VariantSpec {
                 name: "demc-nosn",
                 encoders: &[&[Input::Features], &[Input::Color]],
                 color_channels: COLOR_CHANNELS,
+                halvings: LEVELS,
+                pads_with_zeros: false,
             },
             Variant::Semc => &VariantSpec {
                 name: "semc",
                 encoders: &[&[Input::DetailMap, Input::Color]],
                 color_channels: COLOR_CHANNELS,
+                halvings: LEVELS,
+                pads_with_zeros: false,
             },
             Variant::ColorOnly => &VariantSpec {
                 name: "color-only",
                 encoders: &[&[Input::Color]],
                 color_channels: COLOR_CHANNELS,
+                halvings: LEVELS,
+                pads_with_zeros: false,
             },
             Variant::Kpcn => &VariantSpec {
                 name: "kpcn",
                 encoders: &[],
                 color_channels: 2 * COLOR_CHANNELS,
+                halvings: LEVELS,
+                pads_with_zeros: false,
+            },
+            Variant::Unet => &VariantSpec {
+                name: "unet",
+                encoders: &[],
+                color_channels: COLOR_CHANNELS,
+                halvings: UNET_LEVELS,
+                pads_with_zeros: true,
             },
         }
     }
@@ -278,6 +308,12 @@ pub struct ModelConfig {
     pub head: Head,
     /// Initialisation of the detail map.
     pub detail: Detail,
+    /// Size of a U-Net; `None` means base.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub size: Option<UnetSize>,
+    /// Guides of a U-Net; `None` means albedo and normal.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub guides: Option<Guides>,
 }
 
 impl Default for ModelConfig {
@@ -290,6 +326,8 @@ impl Default for ModelConfig {
             levels: LEVEL_WIDTHS,
             head: Head::Grey,
             detail: Detail::Open,
+            size: None,
+            guides: None,
         }
     }
 }
@@ -299,8 +337,13 @@ impl Default for ModelConfig {
 impl fmt::Display for ModelConfig {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (variant, reading) = (self.variant.spec().name, self.reading.spec().name);
-        if self.variant == Variant::Kpcn {
-            return write!(f, "{variant}, width {}", self.width);
+        match self.variant {
+            Variant::Kpcn => return write!(f, "{variant}, width {}", self.width),
+            Variant::Unet => {
+                let [size, guides] = [self.unet_size().spec().name, self.guides().name()];
+                return write!(f, "{variant}, {size}, guides {guides}");
+            }
+            _ => (),
         }
         write!(f, "{variant}, {reading} reading, width {}", self.width)?;
         match self.levels {
@@ -311,6 +354,34 @@ impl fmt::Display for ModelConfig {
 }
 
 impl ModelConfig {
+    /// Size of a U-Net.
+    pub fn unet_size(&self) -> UnetSize {
+        self.size.unwrap_or_default()
+    }
+
+    /// Guides of a U-Net.
+    pub fn guides(&self) -> Guides {
+        self.guides.unwrap_or_default()
+    }
+
+    /// Whether one of the 12 feature channels has any effect.
+    pub fn takes_feature(&self, channel: usize) -> bool {
+        match self.variant {
+            Variant::Unet => {
+                let firsts = self.guides().first_channels().iter();
+                firsts
+                    .into_iter()
+                    .any(|first| (*first..first + 3).contains(&channel))
+            }
+            _ => self.variant.spec().takes_features(),
+        }
+    }
+
+    /// Whether any feature has an effect.
+    pub fn takes_features(&self) -> bool {
+        (0..FEATURE_CHANNELS).any(|channel| self.takes_feature(channel))
+    }
+
     /// Channels of each level, from the full resolution down.
     pub fn level_channels(&self) -> [usize; LEVELS] {
         self.levels.map(|factor| factor * self.width)
@@ -338,17 +409,42 @@ impl ModelConfig {
                 "model.levels = {levels:?}: each must be from 1 to {MAX_LEVEL}"
             ));
         }
-        let paper = ModelConfig {
-            variant: self.variant,
-            width: self.width,
-            ..ModelConfig::default()
+        let used = match self.variant {
+            Variant::Kpcn => ModelConfig {
+                width: self.width,
+                ..ModelConfig::default()
+            },
+            Variant::Unet => ModelConfig {
+                size: self.size,
+                guides: self.guides,
+                ..ModelConfig::default()
+            },
+            _ => ModelConfig {
+                size: None,
+                guides: None,
+                ..*self
+            },
         };
-        if self.variant == Variant::Kpcn && *self != paper {
-            problems.push(
-                "model: reading, levels, head, and detail have no meaning for variant kpcn; remove them".into(),
-            );
+        let used = ModelConfig {
+            variant: self.variant,
+            ..used
+        };
+        if *self != used {
+            let (unused, name) = (self.unused_keys(), self.variant.spec().name);
+            problems.push(format!(
+                "model: {unused} have no meaning for variant {name}; remove them"
+            ));
         }
         problems
+    }
+
+    /// The keys of other variants, for a message.
+    fn unused_keys(&self) -> &'static str {
+        match self.variant {
+            Variant::Kpcn => "reading, levels, head, detail, size, and guides",
+            Variant::Unet => "reading, width, levels, head, and detail",
+            _ => "size and guides",
+        }
     }
 }
 

@@ -1,6 +1,6 @@
 //! Cost of a network that is not built: trainable values and floating-point operations.
 
-use crate::config::{LEVELS, ModelConfig};
+use crate::config::ModelConfig;
 use crate::weights::{Role, Stage, WeightSpec};
 
 /// Floating-point operations of a multiplication with its addition.
@@ -29,7 +29,7 @@ impl ModelConfig {
         let specs = self.weight_specs().into_iter();
         let kernels = specs.filter(|spec| spec.rows().is_some());
         kernels
-            .map(|spec| MULTIPLY_ADD * spec.len() as f64 * share_of_pixels(&spec))
+            .map(|spec| MULTIPLY_ADD * spec.len() as f64 * share_of_pixels(self.level_of(&spec)))
             .sum()
     }
 
@@ -42,7 +42,7 @@ impl ModelConfig {
             let level = match spec.stage {
                 // At the resolution of its output.
                 Stage::Decoder { level } => level,
-                _ => level_of(spec),
+                _ => self.level_of(spec),
             };
             Some(spec.rows()? as f64 * 0.25f64.powi(level as i32))
         });
@@ -50,6 +50,16 @@ impl ModelConfig {
         let values = MAPS_KEPT * maps.sum::<f64>() * pixels;
         let states = WEIGHT_COPIES * self.parameter_count();
         (values as u64 + states) * size_of::<f32>() as u64
+    }
+
+    /// The level of a kernel's input. A deconvolution is applied to the level below its own.
+    fn level_of(&self, spec: &WeightSpec) -> usize {
+        match spec.stage {
+            Stage::Fusion => 0,
+            Stage::Encoder { level, .. } | Stage::Head { level } => level,
+            Stage::Latent => self.variant.spec().halvings,
+            Stage::Decoder { level } => level + usize::from(spec.role == Role::Deconvolution),
+        }
     }
 
     /// The width with the number of trainable values that is nearest to `parameters`.
@@ -66,27 +76,17 @@ impl ModelConfig {
     }
 }
 
-/// The level of a kernel's input. A deconvolution is applied to the level below its own.
-fn level_of(spec: &WeightSpec) -> usize {
-    match spec.stage {
-        Stage::Fusion => 0,
-        Stage::Encoder { level, .. } | Stage::Head { level } => level,
-        Stage::Latent => LEVELS,
-        Stage::Decoder { level } => level + usize::from(spec.role == Role::Deconvolution),
-    }
-}
-
-/// The pixels to which a kernel is applied, as a share of the image's. Each level has a quarter of
-/// the pixels of the level above.
-fn share_of_pixels(spec: &WeightSpec) -> f64 {
-    0.25f64.powi(level_of(spec) as i32)
+/// The pixels of a level, as a share of the image's: each has a quarter of the level above.
+fn share_of_pixels(level: usize) -> f64 {
+    0.25f64.powi(level as i32)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Reading, Variant};
+    use crate::config::{LEVELS, Reading, Variant};
     use crate::kernel_head::KERNEL_LEVELS;
+    use crate::unet::{Guides, UNET_LEVELS, UnetSize};
     use burn::tensor::Device;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
@@ -142,7 +142,35 @@ mod tests {
         assert!((found - 2.0 * expected).abs() < 1e-9 * found, "{found}");
     }
 
+    /// Those of the files that Open Image Denoise ships.
+    #[test]
+    fn unets_have_the_size_of_those_of_open_image_denoise() {
+        for (size, guides, parameters, gigaflops) in [
+            (UnetSize::Small, Guides::AlbedoNormal, 320_035, 124.0),
+            (UnetSize::Base, Guides::AlbedoNormal, 919_811, 251.0),
+            (UnetSize::Large, Guides::AlbedoNormal, 3_848_387, 624.0),
+        ] {
+            let unet = ModelConfig {
+                variant: Variant::Unet,
+                size: Some(size),
+                guides: Some(guides),
+                ..ModelConfig::default()
+            };
+            assert_eq!(unet.parameter_count(), parameters);
+            let found = 1e-3 * unet.flops_per_pixel();
+            assert!((found - gigaflops).abs() < 1.0, "{size:?}: {found}");
+        }
+    }
+
     fn every_network(check: impl Fn(ModelConfig)) {
+        for (size, guides) in UnetSize::ALL.into_iter().zip(Guides::ALL) {
+            check(ModelConfig {
+                variant: Variant::Unet,
+                size: Some(size),
+                guides: Some(guides),
+                ..ModelConfig::default()
+            });
+        }
         for variant in Variant::ALL {
             for reading in Reading::ALL {
                 for width in [1, 3, 7] {
@@ -184,7 +212,15 @@ mod tests {
                 encoder: number(encoder),
                 level: number(level),
             },
-            ["latent", ..] => Stage::Latent,
+            ["latent" | "bottom", ..] => Stage::Latent,
+            ["encoder", level, ..] => Stage::Encoder {
+                encoder: 0,
+                level: number(level),
+            },
+            ["decoder", index, "convs", ..] => Stage::Decoder {
+                level: UNET_LEVELS - 1 - number(index),
+            },
+            ["head", _] => Stage::Head { level: 0 },
             ["decoder", "levels", index, ..] => Stage::Decoder {
                 level: LEVELS - 1 - number(index),
             },

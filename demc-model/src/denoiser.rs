@@ -8,6 +8,7 @@ use crate::config::{ModelConfig, Variant};
 use crate::dual_encoder::DualEncoder;
 use crate::kpcn::Kpcn;
 use crate::ops::{self, Ops};
+use crate::unet::Unet;
 use crate::weights::{
     Builder, Weight, WeightCollector, WeightSpec, Weights, WeightsError, described, random, taken,
 };
@@ -33,6 +34,8 @@ pub enum Body {
     DualEncoder(DualEncoder),
     /// The networks of KPCN.
     Kpcn(Kpcn),
+    /// The U-Net of Open Image Denoise.
+    Unet(Unet),
 }
 
 impl ModelConfig {
@@ -87,6 +90,7 @@ impl Denoiser {
     ) -> Result<Self, WeightsError> {
         let body = match config.variant {
             Variant::Kpcn => Body::Kpcn(Kpcn::build(b, config.width)?),
+            Variant::Unet => Body::Unet(Unet::build(b, config.unet_size(), config.guides())?),
             _ => Body::DualEncoder(DualEncoder::build(b, config, head_bias)?),
         };
         Ok(Denoiser {
@@ -111,11 +115,11 @@ impl Denoiser {
         Denoiser { ops, ..self }
     }
 
-    /// The encoders and the decoder; `None` for KPCN.
+    /// The encoders and the decoder of the paper's networks; `None` for others.
     pub fn dual_encoder(&self) -> Option<&DualEncoder> {
         match &self.body {
             Body::DualEncoder(network) => Some(network),
-            Body::Kpcn(_) => None,
+            Body::Kpcn(_) | Body::Unet(_) => None,
         }
     }
 
@@ -130,6 +134,7 @@ impl Denoiser {
         match &self.body {
             Body::DualEncoder(network) => network.visit(visitor),
             Body::Kpcn(networks) => networks.visit(visitor),
+            Body::Unet(network) => network.visit(visitor),
         }
     }
 

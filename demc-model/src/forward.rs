@@ -4,21 +4,20 @@ use std::ops::ControlFlow;
 
 use burn::tensor::{Device, Tensor};
 
-use crate::config::{DOWNSAMPLING, FEATURE_CHANNELS};
+use crate::config::FEATURE_CHANNELS;
 use crate::denoiser::{Body, Denoiser};
-use crate::dual_encoder::DualEncoder;
 use crate::inference::{self, Cancelled, Observer};
 
 impl Denoiser {
-    /// Denoises colour with features: gamma-compressed colour with Z-scored features, or for KPCN the
-    /// inputs of [`Kpcn::forward`](crate::kpcn::Kpcn::forward).
+    /// Denoises colour with features: gamma-compressed colour with Z-scored features, or the inputs of
+    /// [`Kpcn::forward`](crate::kpcn::Kpcn::forward) and [`Unet::forward`](crate::unet::Unet::forward).
     ///
     /// A device with autodiff normalises by the statistics of the batch, a device without by the
     /// running ones.
     ///
     /// # Shapes
     /// `color` `[B, 3, H, W]`, for KPCN `[B, 6, H, W]`; `features` `[B, 12, H, W]`; H and W multiples of
-    /// 32. Returns the shape of `color`, in its space; not negative except for KPCN.
+    /// 32, for a U-Net of 16. Returns the shape of `color`, in its space; not negative except for KPCN.
     ///
     /// # Panics
     /// If the tensors have other shapes.
@@ -64,18 +63,24 @@ impl Denoiser {
         observer: &mut Observer,
     ) -> Result<(Tensor<4>, Option<Tensor<4>>), Cancelled> {
         let colors = self.config().variant.spec().color_channels;
-        assert_shapes(colors, color.dims(), features.dims());
+        let unit = 1 << self.config().variant.spec().halvings;
+        assert_shapes(colors, unit, color.dims(), features.dims());
         if let Some(layers) = &layers {
             self.assert_layers(color.dims(), layers.dims());
         }
         match &self.body {
-            Body::DualEncoder(network) if self.infers_on(network, &color.device()) => {
+            Body::DualEncoder(network) if self.infers_on(&network.device(), &color.device()) => {
                 inference::forward(network, [color, features], layers, observer)
             }
             Body::DualEncoder(network) => {
                 Ok(network.forward([color, features], layers, self.ops()))
             }
             Body::Kpcn(networks) => Ok((networks.forward(color, features, self.ops()), None)),
+            Body::Unet(network) if self.infers_on(&network.device(), &color.device()) => {
+                let out = inference::forward_unet(network, color, features, observer)?;
+                Ok((out, None))
+            }
+            Body::Unet(network) => Ok((network.forward(color, features, self.ops()), None)),
         }
     }
 
@@ -98,14 +103,14 @@ impl Denoiser {
     pub fn detail_map(&self, features_z: Tensor<4>) -> Option<Tensor<4>> {
         match &self.body {
             Body::DualEncoder(network) => network.detail_map(features_z, self.ops()),
-            Body::Kpcn(_) => None,
+            Body::Kpcn(_) | Body::Unet(_) => None,
         }
     }
 
-    /// Whether `network` denoises an image on `device` by [`inference`]: the kernels run and nothing is
-    /// differentiated.
-    fn infers_on(&self, network: &DualEncoder, device: &Device) -> bool {
-        let differentiates = device.is_autodiff() || network.device().is_autodiff();
+    /// Whether a network with its weights on `weights` denoises an image on `device` by
+    /// [`inference`]: the kernels run and nothing is differentiated.
+    fn infers_on(&self, weights: &Device, device: &Device) -> bool {
+        let differentiates = device.is_autodiff() || weights.is_autodiff();
         self.ops().on(device).has_fast_inference() && !differentiates
     }
 }
@@ -115,7 +120,12 @@ fn never_cancelled(_: f64) -> ControlFlow<()> {
     ControlFlow::Continue(())
 }
 
-fn assert_shapes(colors: usize, [batch, found, height, width]: [usize; 4], features: [usize; 4]) {
+fn assert_shapes(
+    colors: usize,
+    unit: usize,
+    [batch, found, height, width]: [usize; 4],
+    features: [usize; 4],
+) {
     assert_eq!(found, colors, "color has {colors} channels");
     assert_eq!(
         features,
@@ -123,7 +133,7 @@ fn assert_shapes(colors: usize, [batch, found, height, width]: [usize; 4], featu
         "features has {FEATURE_CHANNELS} channels and the size of color"
     );
     assert!(
-        height > 0 && width > 0 && height % DOWNSAMPLING == 0 && width % DOWNSAMPLING == 0,
-        "{height} x {width}: height and width are multiples of {DOWNSAMPLING}"
+        height > 0 && width > 0 && height % unit == 0 && width % unit == 0,
+        "{height} x {width}: height and width are multiples of {unit}"
     );
 }

@@ -10,6 +10,8 @@
 //! five times and fuses the encoders' skips at each level. The layers run on one of two
 //! implementations ([`ops`]): our CPU kernels or Burn's operations.
 //!
+//! [`kpcn`] and [`unet`] are networks of others: one to compare with, one to start from.
+//!
 //! Tensors are NCHW and float32; height and width are multiples of [`DOWNSAMPLING`]. `demc-data`
 //! provides files, statistics and patches.
 
@@ -29,6 +31,8 @@ pub mod layers;
 pub mod loss;
 pub mod metrics;
 pub mod ops;
+pub mod unet;
+mod unet_size;
 pub mod weights;
 
 pub use config::{DOWNSAMPLING, Detail, Head, ModelConfig, Reading, Variant};

@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ._native import DemcError, __version__
     from .denoising import Denoised, DemcWarning, Model, denoise
-    from .programs import denoise_exr
+    from .programs import denoise_exr, import_oidn
     from .training import TakenStep, TrainResult, evaluate, train
 
 _MODULES = {
     "_native": ["DemcError", "__version__"],
     "denoising": ["Denoised", "DemcWarning", "Model", "denoise"],
-    "programs": ["denoise_exr"],
+    "programs": ["denoise_exr", "import_oidn"],
     "training": ["TakenStep", "TrainResult", "evaluate", "train"],
     "torch": [],
 }
@@ -40,6 +40,7 @@ __all__ = [
     "denoise",
     "denoise_exr",
     "evaluate",
+    "import_oidn",
     "train",
 ]
 

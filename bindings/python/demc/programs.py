@@ -1,4 +1,4 @@
-"""The command-line programs `demc-infer`, `demc-data`, and `demc-train`, and `demc.denoise_exr`."""
+"""The command-line programs `demc-infer`, `demc-data`, and `demc-train`; `demc.denoise_exr` and `demc.import_oidn`."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from . import _native
+from .denoising import Model
 
 
 def denoise_exr(
@@ -47,6 +48,34 @@ def denoise_exr(
         arguments += ["--layers", pattern]
     arguments += [flag for flag, wanted in (("--repair", repair), ("--overwrite", overwrite)) if wanted]
     _native.run_infer([os.fspath(argument) for argument in [*arguments, "--output", target, "--", source]])
+
+
+def import_oidn(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    weights: str | None = None,
+    overwrite: bool = False,
+) -> Model:
+    """Makes a model file of weights of Open Image Denoise, and loads it.
+
+    Arguments:
+        source: the library `libOpenImageDenoise_core`, such as that of the package `pyoidn`, or a TZA file.
+        target: model file to write.
+        weights: their name in the library; by default `rt_hdr_alb_nrm`.
+        overwrite: whether an existing target is replaced.
+
+    Raises:
+        DemcError: a file without such weights, or a damaged one; an unknown name; an existing target.
+        OSError: a file that cannot be read or written.
+    """
+    arguments = ["demc-infer", "import", "--oidn", os.fspath(source), "--output", os.fspath(target)]
+    if weights is not None:
+        arguments += ["--weights", weights]
+    if overwrite:
+        arguments.append("--overwrite")
+    _native.run_infer(arguments)
+    return Model(target)
 
 
 def infer() -> None:

@@ -23,7 +23,7 @@ try:
     frame = demc.torch.read_exr(arguments.input, arguments.layout, arguments.layer, meta)
     print(frame.layout.describe())
     color, features, scale = demc.torch.preprocess.prepare(frame.color, frame.features, meta)
-    color, features = (demc.torch.preprocess.pad(image)[None] for image in (color, features))
+    color, features = (demc.torch.preprocess.pad(image, meta)[None] for image in (color, features))
     [output] = session.run(["output"], {"color": color, "features": features})
     height, width = frame.color.shape[1:]
     image = output[0, :, :height, :width] / scale

@@ -275,6 +275,27 @@ class Refusals(Native):
                     demc.denoise(self.small, model=path, **self.guides)
                 self.assertNotIn("\n", str(caught.exception))
 
+    def test_weights_of_open_image_denoise(self) -> None:
+        package = importlib.util.find_spec("pyoidn")
+        if package is None and os.environ.get("DEMC_REQUIRE_WHEEL") != "1":
+            self.skipTest("no pyoidn")
+        (folder,) = package.submodule_search_locations
+        library = next(Path(folder).rglob("libOpenImageDenoise_core.so.*"))
+        with tempfile.TemporaryDirectory() as folder:
+            own, other = Path(folder, "own.safetensors"), Path(folder, "other.safetensors")
+            model = demc.import_oidn(library, own, weights="rt_hdr_alb")
+            arguments = ["import", "--oidn", library, "--weights", "rt_hdr_alb", "-o", other]
+            subprocess.run([program("demc-infer"), *arguments], check=True, capture_output=True)
+            self.assertEqual(own.read_bytes(), other.read_bytes())
+            self.assertEqual(model.required, ("albedo",))
+            clean = model.denoise(self.small, albedo=self.guides["albedo"])
+            # Guides that the network does not take change nothing.
+            np.testing.assert_array_equal(clean, model.denoise(self.small, **self.guides))
+            with self.assertRaisesRegex(demc.DemcError, "own.safetensors"):
+                demc.import_oidn(library, own)
+            with self.assertRaisesRegex(demc.DemcError, "no weights `none`; it has .*rt_hdr_alb_nrm"):
+                demc.import_oidn(library, own, weights="none", overwrite=True)
+
     def test_warnings_name_the_caller(self) -> None:
         with self.assertWarnsRegex(demc.DemcWarning, "normal: its length is") as caught:
             demc.denoise(self.small, **{**self.guides, "normal": self.guides["normal"] * 3})

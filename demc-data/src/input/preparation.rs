@@ -4,7 +4,7 @@
 use crate::image::frame::FramePlanes;
 use crate::image::plane::Plane;
 use crate::input::position::{PositionSpace, map_planes};
-use crate::input::ranges::exposure;
+use crate::input::transfer::Transfer;
 use crate::input::transform::exposure_scale;
 
 /// The steps on a whole image; by default none.
@@ -14,6 +14,8 @@ pub struct Preparation {
     pub position: PositionSpace,
     /// The exposure that every image is scaled to.
     pub exposure_level: Option<f32>,
+    /// The curve of the colour, which says how an exposure is measured.
+    pub transfer: Transfer,
 }
 
 impl Preparation {
@@ -25,6 +27,7 @@ impl Preparation {
             return 1.0;
         };
         let color: Vec<f32> = planes.color.iter().flat_map(Plane::to_f32).collect();
-        exposure_scale(level, exposure(&color))
+        let exposure = self.transfer.exposure(&color, planes.height, planes.width);
+        exposure_scale(level, exposure)
     }
 }

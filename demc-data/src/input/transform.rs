@@ -4,8 +4,9 @@
 
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::image::frame::{FEATURES, MAX_ALBEDO, TEXTURES};
+use crate::image::frame::{FEATURES, MAX_ALBEDO, POSITIONS, TEXTURES};
 use crate::input::position::{PositionMap, PositionSpace};
+use crate::input::transfer::Transfer;
 
 /// Minimum standard deviation of a feature channel, in the channel's own unit (ours: the paper is
 /// silent). It makes a constant channel zero instead of 0/0. 1e-3 is half precision's spacing at 1,
@@ -25,12 +26,29 @@ pub struct FeatureStats {
     pub std: [f32; FEATURES],
 }
 
+impl FeatureStats {
+    /// These statistics, or for Open Image Denoise's curve the ranges that its networks expect: normals
+    /// from 0 to 1, albedo as it is.
+    pub fn with_ranges_of(mut self, transfer: Transfer) -> Self {
+        if transfer == Transfer::Pu {
+            self.mean[..POSITIONS].fill(-1.0);
+            self.std[..POSITIONS].fill(2.0);
+            self.mean[TEXTURES..].fill(0.0);
+            self.std[TEXTURES..].fill(1.0);
+        }
+        self
+    }
+}
+
 /// Converts colour and features to the network's input space and back.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Normalizer {
     /// The exponent of Eq. 4 is `1 / gamma`; 2.2 in the paper.
     pub gamma: f32,
+    /// The curve between radiance and the network's colour.
+    #[serde(default, skip_serializing_if = "Transfer::is_gamma")]
+    pub transfer: Transfer,
     /// Epsilon of the [modulation](Self::modulation); `None`: colour is not divided. Files store it
     /// as `demodulate`, and 0 there means `None` (bundle format 1).
     #[serde(
@@ -43,7 +61,7 @@ pub struct Normalizer {
     /// What the origin and the unit of positions are.
     #[serde(default, skip_serializing_if = "PositionSpace::is_scene")]
     pub position: PositionSpace,
-    /// The [exposure](crate::input::ranges::exposure) that every image is scaled to before the network; the
+    /// The [exposure](Transfer::exposure) that every image is scaled to before the network; the
     /// output is scaled back. `None`: images keep theirs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub exposure_level: Option<f32>,
@@ -105,31 +123,29 @@ impl Normalizer {
         for value in &mut *albedo {
             *value = value.clamp(0.0, MAX_ALBEDO) + epsilon;
         }
-        gamma_from_hdr(albedo, self.gamma);
+        Transfer::Gamma.compress(albedo, self.gamma);
     }
 
-    /// Compresses linear radiance in place, `max(x, 0)^(1/gamma)` (Eq. 4), and divides it by the
-    /// [modulation](Self::modulation).
-    pub fn color_gamma_from_hdr(&self, color: &mut [f32], modulation: Option<&[f32]>) {
-        gamma_from_hdr(color, self.gamma);
+    /// Compresses linear radiance in place, in the paper to `max(x, 0)^(1/gamma)` (Eq. 4), and divides
+    /// it by the [modulation](Self::modulation).
+    pub fn compress(&self, color: &mut [f32], modulation: Option<&[f32]>) {
+        self.transfer.compress(color, self.gamma);
         for (value, factor) in color.iter_mut().zip(modulation.into_iter().flatten()) {
             *value /= factor;
         }
     }
 
-    /// Multiplies gamma-compressed colour by the [modulation](Self::modulation) and expands it, in
-    /// place: `max(x, 0)^gamma`.
-    pub fn color_hdr_from_gamma(&self, color: &mut [f32], modulation: Option<&[f32]>) {
+    /// Multiplies compressed colour by the [modulation](Self::modulation) and expands it to linear
+    /// radiance, in place.
+    pub fn expand(&self, color: &mut [f32], modulation: Option<&[f32]>) {
         for (value, factor) in color.iter_mut().zip(modulation.into_iter().flatten()) {
             *value *= factor;
         }
-        for value in color {
-            *value = value.max(0.0).powf(self.gamma);
-        }
+        self.transfer.expand(color, self.gamma);
     }
 
     /// Converts features to Z-scores in place: `(x - mean) / std`. Albedo above [`MAX_ALBEDO`]
-    /// counts as that.
+    /// counts as that. With Open Image Denoise's curve, normals count from -1 to 1, albedo from 0.
     ///
     /// # Shapes
     /// `planes` is `[12, N]`.
@@ -140,6 +156,14 @@ impl Normalizer {
         let pixels = planes.len() / FEATURES;
         for value in &mut planes[TEXTURES * pixels..] {
             *value = value.min(MAX_ALBEDO);
+        }
+        if self.transfer == Transfer::Pu {
+            let (normals, others) = planes.split_at_mut(POSITIONS * pixels);
+            normals
+                .iter_mut()
+                .for_each(|value| *value = value.clamp(-1.0, 1.0));
+            let albedo = &mut others[(TEXTURES - POSITIONS) * pixels..];
+            albedo.iter_mut().for_each(|value| *value = value.max(0.0));
         }
         self.for_each_feature(planes, |value, mean, std| (value - mean) / std);
     }
@@ -182,14 +206,6 @@ pub fn exposure_scale(level: f32, exposure: f64) -> f32 {
     scale.clamp(1.0 / limit, limit) as f32
 }
 
-/// Compresses linear radiance in place: `max(x, 0)^(1/gamma)` (Eq. 4).
-pub fn gamma_from_hdr(color: &mut [f32], gamma: f32) {
-    let exponent = 1.0 / gamma;
-    for value in color {
-        *value = value.max(0.0).powf(exponent);
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -203,6 +219,7 @@ mod tests {
             gamma: 2.2,
             albedo_demodulation_epsilon: None,
             position: PositionSpace::Scene,
+            transfer: Transfer::Gamma,
             exposure_level: None,
             restore_light: false,
             features,
@@ -214,8 +231,8 @@ mod tests {
     fn gamma_comes_back_to_the_radiance() {
         let hdr = [0.0, 1e-4, 0.18, 1.0, 9.9, 65504.0];
         let mut color = hdr;
-        normalizer().color_gamma_from_hdr(&mut color, None);
-        normalizer().color_hdr_from_gamma(&mut color, None);
+        normalizer().compress(&mut color, None);
+        normalizer().expand(&mut color, None);
         for (back, hdr) in color.into_iter().zip(hdr) {
             // f32 has 24 bits; two powers lose a few bits at large exponents.
             assert!((back - hdr).abs() <= 1e-5 * hdr, "{back} is not {hdr}");
@@ -225,7 +242,7 @@ mod tests {
     #[test]
     fn gamma_matches_a_hand_computed_value_and_keeps_the_ends() {
         let mut color = [0.5, 0.0, 1.0, -3.0];
-        normalizer().color_gamma_from_hdr(&mut color, None);
+        normalizer().compress(&mut color, None);
         assert!((color[0] - 0.729_740_1).abs() < 1e-6, "{}", color[0]);
         assert_eq!(color[1..], [0.0, 1.0, 0.0]);
     }
@@ -245,12 +262,12 @@ mod tests {
         let divisors = [0.5, 0.07, 0.25, 0.07, 1.0, 0.07];
         let hdr: Vec<f32> = light.iter().zip(divisors).map(|(a, b)| a * b).collect();
         let mut color = hdr.clone();
-        normalizer.color_gamma_from_hdr(&mut color, Some(&modulation));
+        normalizer.compress(&mut color, Some(&modulation));
         for (color, light) in color.iter().zip(light) {
             let expected = light.powf(1.0 / 2.2);
             assert!((color - expected).abs() < 1e-5, "{color} is not {expected}");
         }
-        normalizer.color_hdr_from_gamma(&mut color, Some(&modulation));
+        normalizer.expand(&mut color, Some(&modulation));
         for (back, hdr) in color.iter().zip(hdr) {
             assert!((back - hdr).abs() <= 1e-5 * hdr, "{back} is not {hdr}");
         }

@@ -288,8 +288,7 @@ impl PatchSource {
         }
         drop_buffers(place.features, place.draw.dropped);
         let modulation = self.normalizer.modulation(place.features);
-        self.normalizer
-            .color_gamma_from_hdr(place.color, modulation.as_deref());
+        self.normalizer.compress(place.color, modulation.as_deref());
         if let (Some(out), Some(modulation)) = (&mut place.modulation, &modulation) {
             out.copy_from_slice(modulation);
         }

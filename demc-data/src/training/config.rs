@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::input::position::PositionSpace;
 use crate::input::preparation::Preparation;
+use crate::input::transfer::Transfer;
 use crate::training::augment::Augment;
 use crate::training::dropout::Dropout;
 
@@ -60,6 +61,9 @@ pub struct DataConfig {
     pub stride: usize,
     /// The transfer function's exponent is `1 / gamma` (Eq. 4); from 1 to 6.
     pub gamma: f32,
+    /// `"gamma"`: the network's colour is `x^(1/gamma)`, as in the paper; `"pu"`: it has Open Image
+    /// Denoise's curve, and normals and albedo have its ranges.
+    pub transfer: Transfer,
     /// Albedo demodulation divides the input colour by (albedo + epsilon) and multiplies the output
     /// by it ([`crate::input::transform::Normalizer::modulation`]). From 0.001 to 1; absent: off, as in the paper.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -67,8 +71,8 @@ pub struct DataConfig {
     /// `"scene"`: positions as rendered, as in the paper; `"image"`: relative to the image
     /// ([`crate::input::position::PositionMap`]).
     pub position: PositionSpace,
-    /// Every image is scaled to this exposure ([`crate::input::ranges::exposure`]) before the network, and
-    /// back afterwards. From 0.001 to 10; absent: images keep their exposure, as in the paper.
+    /// Every image is scaled to this exposure ([`Transfer::exposure`]) before the network, and back
+    /// afterwards. From 0.001 to 10; absent: images keep their exposure, as in the paper.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub exposure_level: Option<f32>,
     /// Whether denoising gives the output the light of the noisy image; off in the paper. Training does
@@ -99,6 +103,7 @@ impl Default for DataConfig {
             patch_size: PATCH_SIZE,
             stride: STRIDE,
             gamma: GAMMA,
+            transfer: Transfer::Gamma,
             albedo_demodulation_epsilon: None,
             position: PositionSpace::Scene,
             exposure_level: None,
@@ -119,6 +124,7 @@ impl DataConfig {
         Preparation {
             position: self.position,
             exposure_level: self.exposure_level,
+            transfer: self.transfer,
         }
     }
 
@@ -160,6 +166,12 @@ impl DataConfig {
                 "from 0.001 to 1; remove the key to switch demodulation off",
             );
         }
+        require(
+            self.transfer.is_gamma() || self.albedo_demodulation_epsilon.is_none(),
+            "transfer",
+            &self.transfer,
+            "\"gamma\" with data.albedo_demodulation_epsilon",
+        );
         if let Some(level) = self.exposure_level {
             require(
                 EXPOSURE_LEVELS.contains(&level),

@@ -65,6 +65,7 @@ impl Statistics {
     ) -> Result<Self, Error> {
         let DataConfig {
             gamma,
+            transfer,
             albedo_demodulation_epsilon,
             position,
             exposure_level,
@@ -86,6 +87,7 @@ impl Statistics {
         Ok(Self {
             normalizer: Normalizer {
                 gamma,
+                transfer,
                 albedo_demodulation_epsilon,
                 position,
                 exposure_level,
@@ -95,10 +97,11 @@ impl Statistics {
                     std: total
                         .features
                         .map(|moments| (moments.std() as f32).max(STD_FLOOR)),
-                },
+                }
+                .with_ranges_of(transfer),
                 flat_color: total
                     .color
-                    .map(|channel| channel.best().powf(1.0 / f64::from(gamma)) as f32),
+                    .map(|channel| transfer.compressed(channel.best(), gamma)),
             },
             ranges: Ranges::of(&summaries),
             pixels: total.pixels,

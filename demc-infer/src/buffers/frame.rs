@@ -69,7 +69,7 @@ impl Bundle {
             ("albedo", &buffers.albedo),
             ("albedo2", &buffers.albedo2),
         ];
-        let is_used = self.meta.model.variant.spec().takes_features();
+        let is_used = self.meta.model.takes_features();
         for ((buffer, view), missing) in views.into_iter().zip(self.missing().in_order()) {
             match (view, missing) {
                 (Some(view), _) => {

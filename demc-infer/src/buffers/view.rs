@@ -212,6 +212,12 @@ impl<'a> View<'a> {
         Ok(planar)
     }
 
+    /// Height and width in pixels.
+    pub fn size(&self) -> (usize, usize) {
+        let [_, height, width] = self.placement.shape;
+        (height, width)
+    }
+
     fn sample<const N: usize>(&self, start: usize) -> [u8; N] {
         std::array::from_fn(|byte| self.bytes[start + byte])
     }

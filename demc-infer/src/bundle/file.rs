@@ -29,7 +29,15 @@ const MAX_HEADER: u64 = 4 << 20;
 const LENGTH: usize = 8;
 
 /// The keys of [`BundleMeta`].
-const META_KEYS: [&str; 6] = ["format", "model", "normalizer", "layout", "step", "ranges"];
+const META_KEYS: [&str; 7] = [
+    "format",
+    "model",
+    "normalizer",
+    "layout",
+    "step",
+    "ranges",
+    "license",
+];
 
 /// The keys beside them in a header entry.
 const HEADER_KEYS: [&str; 3] = ["names", "sha256", FILTER_KEY];
@@ -310,6 +318,14 @@ fn statistics_problems(meta: &BundleMeta) -> Vec<String> {
             "normalizer.gamma: {} is not {GAMMA}, as a kernel head needs",
             normalizer.gamma
         ));
+    }
+    let needs_gamma = meta.model.head == Head::Kernel
+        || normalizer.albedo_demodulation_epsilon.is_some()
+        || !meta.layout.inputs.is_demc();
+    if needs_gamma && !normalizer.transfer.is_gamma() {
+        problems.push(
+            "normalizer.transfer: not gamma, as a kernel head, demodulation, or kpcn needs".into(),
+        );
     }
     let features = &normalizer.features;
     for (channel, (mean, std)) in FEATURE_NAMES

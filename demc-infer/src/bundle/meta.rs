@@ -25,6 +25,10 @@ pub struct BundleMeta {
     /// unknown.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ranges: Option<Ranges>,
+    /// The licence of weights that come from another program, and of those trained from them; `None` for
+    /// weights of one's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub license: Option<String>,
 }
 
 impl BundleMeta {
@@ -45,6 +49,15 @@ impl BundleMeta {
             },
             step,
             ranges: None,
+            license: None,
+        }
+    }
+
+    /// Adds the licence of weights that come from another program.
+    pub fn with_license(self, license: impl Into<String>) -> Self {
+        Self {
+            license: Some(license.into()),
+            ..self
         }
     }
 
@@ -69,6 +82,9 @@ impl BundleMeta {
     pub fn filter_problem(&self, inputs: InputKind, position: PositionSpace) -> Option<String> {
         if !(inputs.is_demc() && self.layout.inputs.is_demc()) {
             return Some("kpcn neither has an albedo filter nor is one".into());
+        }
+        if self.model.variant.spec().pads_with_zeros {
+            return Some("a network of variant unet cannot be an albedo filter".into());
         }
         // The variant without features takes no positions.
         let same = self.normalizer.position == position || self.model.variant == Variant::ColorOnly;

@@ -3,6 +3,7 @@
 use burn::tensor::Device;
 use demc_data::input::kpcn::PASS_PLANES;
 use demc_data::{ChannelLayout, FEATURES, FeatureStats, Frame, Normalizer, PositionSpace};
+use demc_model::unet::UnetSize;
 use demc_model::{Head, ModelConfig, Reading, Variant, Weights};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -33,15 +34,22 @@ pub(crate) fn kernel_bundle() -> Bundle {
 }
 
 fn bundle_with(variant: Variant, head: Head) -> Bundle {
-    let model = ModelConfig {
-        variant,
-        reading: match variant {
-            Variant::Kpcn => Reading::Paper,
-            _ => Reading::Released,
+    let model = match variant {
+        Variant::Unet => ModelConfig {
+            variant,
+            size: Some(UnetSize::Small),
+            ..ModelConfig::default()
         },
-        width: 2,
-        head,
-        ..ModelConfig::default()
+        _ => ModelConfig {
+            variant,
+            reading: match variant {
+                Variant::Kpcn => Reading::Paper,
+                _ => Reading::Released,
+            },
+            width: 2,
+            head,
+            ..ModelConfig::default()
+        },
     };
     let features = FeatureStats {
         mean: std::array::from_fn(|channel| 0.1 * channel as f32),
@@ -51,6 +59,7 @@ fn bundle_with(variant: Variant, head: Head) -> Bundle {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
         position: PositionSpace::Scene,
+        transfer: demc_data::Transfer::Gamma,
         exposure_level: None,
         restore_light: false,
         features,

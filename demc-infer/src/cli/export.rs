@@ -24,11 +24,12 @@ const PYTHON_VARIABLE: &str = "DEMC_PYTHON";
 /// Value of `--albedo-filter` that removes the filter.
 const NO_FILTER: &str = "none";
 
-/// Export a model as one file: safetensors or an ONNX graph.
+/// Export a model as one file: safetensors, an ONNX graph, or weights for Open Image Denoise.
 ///
 /// A safetensors file has the weights, configuration, statistics and channel layout. `demc-infer`
 /// loads it like a run directory, with either set of names. An ONNX graph takes a renderer's HDR
-/// colour and raw features as input and returns HDR colour.
+/// colour and raw features as input and returns HDR colour. A TZA file has the weights of a U-Net
+/// for Open Image Denoise.
 ///
 /// The file is read back and compared.
 #[derive(Args)]
@@ -36,11 +37,12 @@ const NO_FILTER: &str = "none";
   demc-infer export --model runs/demc -o demc.safetensors
   demc-infer export --model runs/demc --names torch --precision f16 -o demc-torch.safetensors
   demc-infer export --model runs/demc --verify -o demc.onnx
+  demc-infer export --model runs/unet --precision f16 -o unet.tza
   demc-infer export --model runs/demc --albedo-filter runs/albedo -o demc-filtered.safetensors")]
 pub struct Arguments {
     #[command(flatten)]
     model: ModelFlag,
-    /// File format [default: onnx for FILE.onnx, otherwise safetensors]
+    /// File format [default: onnx for FILE.onnx, tza for FILE.tza, otherwise safetensors]
     #[arg(long, value_enum)]
     format: Option<Format>,
     /// Names of the tensors in a safetensors file: Burn's, or those that PyTorch's load_state_dict
@@ -64,7 +66,7 @@ pub struct Arguments {
     output: PathBuf,
     #[command(flatten)]
     overwrite: OverwriteFlag,
-    /// Run the file on synthetic images in ONNX Runtime or PyTorch and compare. Deviations above
+    /// Run the file on synthetic images in ONNX Runtime, PyTorch, or Open Image Denoise and compare. Deviations above
     /// 1e-4, or 1e-3 of a value of a kernel head, fail
     #[arg(long)]
     verify: bool,
@@ -79,6 +81,8 @@ enum Format {
     Safetensors,
     /// A graph for ONNX Runtime, TensorRT, OpenVINO and others
     Onnx,
+    /// Weights of variant unet for Open Image Denoise
+    Tza,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -119,7 +123,7 @@ impl Arguments {
             NamesFlag::Burn => Names::Burn,
             NamesFlag::Torch => Names::Torch,
         };
-        if format == Format::Onnx && names == Names::Torch {
+        if format != Format::Safetensors && names == Names::Torch {
             return Err(UsageError("--names is for safetensors only".into()).into());
         }
         let precision = match self.precision {
@@ -151,6 +155,12 @@ impl Arguments {
                 bundle.export_onnx(&self.output, precision)?;
                 message::status(format_args!("{output}: ONNX graph, read back and compared"));
             }
+            Format::Tza => {
+                bundle.export_tza(&self.output, precision)?;
+                message::status(format_args!(
+                    "{output}: weights for Open Image Denoise, read back and compared"
+                ));
+            }
         }
         if self.verify {
             self.verify(format, &bundle.rounded(precision)?)
@@ -165,6 +175,7 @@ impl Arguments {
         let extension = self.output.extension().and_then(OsStr::to_str);
         let named = match extension.map(str::to_ascii_lowercase).as_deref() {
             Some("onnx") => Some(Format::Onnx),
+            Some("tza") => Some(Format::Tza),
             Some("safetensors") => Some(Format::Safetensors),
             _ => None,
         };
@@ -188,6 +199,7 @@ impl Arguments {
         let runtime = match format {
             Format::Onnx => Runtime::OnnxRuntime,
             Format::Safetensors => Runtime::PyTorch,
+            Format::Tza => Runtime::Oidn,
         };
         let found = verify(&self.output, runtime, &python, expected)?;
         message::result(&format!(

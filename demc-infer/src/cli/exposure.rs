@@ -6,7 +6,6 @@ use std::str::FromStr;
 
 use clap::Args;
 use demc_data::image::exr::ExrFile;
-use demc_data::input::ranges::exposure;
 
 use super::exposure_curve::ExposureCurve;
 use super::inputs::{Place, Sequence, place};
@@ -133,7 +132,8 @@ fn exposure_of(path: &Path, bundle: &Bundle, layouts: &Layouts) -> Result<f64, d
     file.require(&names)?;
     let planes = file.read(&names)?;
     let color: Vec<f32> = planes.iter().flat_map(|plane| plane.to_f32()).collect();
-    Ok(exposure(&color))
+    let window = &file.channel(names[0]).expect("it was required").window;
+    Ok(bundle.exposure(&color, window.height, window.width))
 }
 
 #[cfg(test)]

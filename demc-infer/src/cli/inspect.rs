@@ -105,7 +105,13 @@ impl ModelSummary {
         writeln!(t, "step        {}", meta.step)?;
         let style = format!("{:?}, {:?} names", self.precision, self.names);
         writeln!(t, "weights     {}", style.to_lowercase())?;
+        if let Some(license) = &meta.license {
+            writeln!(t, "license     {}", printable(license))?;
+        }
         writeln!(t, "gamma       {}", meta.normalizer.gamma)?;
+        if !meta.normalizer.transfer.is_gamma() {
+            writeln!(t, "transfer    Open Image Denoise's curve")?;
+        }
         if let Some(FilterSummary { meta, parameters }) = &self.albedo_filter {
             let (model, step) = (meta.model, meta.step);
             writeln!(

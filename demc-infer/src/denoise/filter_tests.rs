@@ -24,6 +24,7 @@ fn filtered_by_hand(bundle: &Bundle, original: &Frame) -> Frame {
     let padding = Padding {
         height: original.height,
         width: original.width,
+        unit: DOWNSAMPLING,
     };
     let mut padded = Frame::new(
         original.name.clone(),
@@ -69,7 +70,11 @@ fn the_filters_image_replaces_the_albedo() {
         let alpha = |size: usize| (0..size).map(|i| (i % 7) as f32 / 7.0).collect();
         original.alpha = Some(alpha(width * height));
         let by_hand = filtered_by_hand(&bundle, &original);
-        let padding = Padding { height, width };
+        let padding = Padding {
+            height,
+            width,
+            unit: DOWNSAMPLING,
+        };
         let filter = bundle.albedo_filter.as_ref().expect("a filter");
         let alone = filter.filtered_albedo(&original).expect("filtered");
         let expected = padding.crop(albedo(&mut by_hand.clone()));

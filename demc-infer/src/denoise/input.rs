@@ -81,6 +81,7 @@ impl<'a> FrameInput<'a> {
             padding: Padding {
                 height: frame.height,
                 width: frame.width,
+                unit: bundle.unit(),
             },
             device: bundle.device(),
             ensemble: Ensemble::One,
@@ -95,6 +96,7 @@ impl<'a> FrameInput<'a> {
         Padding {
             height: self.padding.padded_height(),
             width: self.padding.padded_width(),
+            unit: self.padding.unit,
         }
     }
 
@@ -231,8 +233,9 @@ impl<'a> FrameInput<'a> {
         let (modulation, features_z) = self.modulation_and_features(rows, columns);
         in_pieces(&mut color, modulation.as_deref(), |color, modulation| {
             color.iter_mut().for_each(|value| *value *= self.scale);
-            normalizer.color_gamma_from_hdr(color, modulation);
+            normalizer.compress(color, modulation);
         });
+        self.blank_padding(&mut color, rows, columns);
         let color_gamma = self.tensor::<COLOR_CHANNELS>(color, rows, columns);
         let layers = LayerTile::new(
             self.layers,
@@ -251,7 +254,7 @@ impl<'a> FrameInput<'a> {
         in_pieces(&mut out, modulation.as_deref(), |out, modulation| {
             // The conversion to HDR would turn NaN into 0.
             let nan: Vec<usize> = (0..out.len()).filter(|i| out[*i].is_nan()).collect();
-            normalizer.color_hdr_from_gamma(out, modulation);
+            normalizer.expand(out, modulation);
             nan.into_iter().for_each(|i| out[i] = f32::NAN);
             out.iter_mut().for_each(|value| *value /= self.scale);
         });
@@ -296,7 +299,7 @@ impl<'a> FrameInput<'a> {
     ) -> (Option<Vec<f32>>, Tensor<4>) {
         let meta = &self.bundle.meta;
         let demodulates = meta.normalizer.albedo_demodulation_epsilon.is_some();
-        if !demodulates && !meta.model.variant.spec().takes_features() {
+        if !demodulates && !meta.model.takes_features() {
             let shape = [1, FEATURES, rows.len(), columns.len()];
             return (None, Tensor::<4>::zeros([1; 4], &self.device).expand(shape));
         }
@@ -310,8 +313,31 @@ impl<'a> FrameInput<'a> {
             albedo
         });
         meta.normalizer.features_z_from_raw(&mut features);
+        self.blank_padding(&mut features, rows, columns);
         let features_z = self.tensor::<FEATURES>(features, rows, columns);
         (modulation, features_z)
+    }
+
+    /// Sets what is outside the image to 0, for a network that was trained so.
+    ///
+    /// # Shapes
+    /// `planes` is `[C, rows, columns]`.
+    fn blank_padding(&self, planes: &mut [f32], rows: &PixelRange, columns: &PixelRange) {
+        if !self.bundle.meta.model.variant.spec().pads_with_zeros {
+            return;
+        }
+        let inside =
+            |range: &PixelRange, length: usize| length.clamp(range.start, range.end) - range.start;
+        let [tall, wide] = [
+            inside(rows, self.frame.height),
+            inside(columns, self.frame.width),
+        ];
+        for plane in planes.chunks_exact_mut(rows.len() * columns.len()) {
+            for (y, row) in plane.chunks_exact_mut(columns.len()).enumerate() {
+                let end = if y < tall { wide } else { 0 };
+                row[end..].fill(0.0);
+            }
+        }
     }
 
     fn features(&self, rows: &PixelRange, columns: &PixelRange) -> Vec<f32> {

@@ -128,7 +128,7 @@ impl Bundle {
         }
         let scale = || match input_scale {
             Some(scale) => *scale,
-            None => self.input_scale(demc_data::input::ranges::exposure(&frame.color)),
+            None => self.input_scale(self.exposure(&frame.color, frame.height, frame.width)),
         };
         let input = || FrameInput::new(self, frame);
         let statistics = || self.check_statistics(frame);
@@ -141,6 +141,7 @@ impl Bundle {
         let size = Padding {
             height: frame.height,
             width: frame.width,
+            unit: self.unit(),
         };
         let tiles = self
             .tiles_beside([outputs(frame), layers.len()], size, tiling, ensemble)
@@ -178,7 +179,18 @@ impl Bundle {
         })
     }
 
-    /// The factor on the colour of an image with this [`exposure`](demc_data::input::ranges::exposure).
+    /// The exposure of planar colour `[3, H, W]`, linear HDR, as this model measures it.
+    pub fn exposure(&self, color_hdr: &[f32], height: usize, width: usize) -> f64 {
+        let transfer = self.meta.normalizer.transfer;
+        transfer.exposure(color_hdr, height, width)
+    }
+
+    /// The sides of an image are padded to multiples of this, in pixels.
+    pub(crate) fn unit(&self) -> usize {
+        1 << self.meta.model.variant.spec().halvings
+    }
+
+    /// The factor on the colour of an image with this [`exposure`](Self::exposure).
     ///
     /// It brings the image to the exposure level of training. It is 1 for a black image.
     ///
@@ -229,7 +241,11 @@ impl Bundle {
         tiling: &Tiling,
         ensemble: Ensemble,
     ) -> Result<Tiles, memory::TooLarge> {
-        let size = Padding { height, width };
+        let size = Padding {
+            height,
+            width,
+            unit: self.unit(),
+        };
         self.tiles_beside([COLOR_CHANNELS, 0], size, tiling, ensemble)
     }
 

@@ -51,6 +51,7 @@ impl FrameInput<'_> {
             let within = Padding {
                 height: rows.read.len(),
                 width: columns.read.len(),
+                unit: 1,
             };
             let inside = |range: &PixelRange, span: &Span| {
                 range.start - span.read.start..range.end - span.read.start

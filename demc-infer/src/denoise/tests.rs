@@ -50,6 +50,7 @@ fn padding_equals_an_image_padded_by_hand() {
     let padding = Padding {
         height: 33,
         width: 31,
+        unit: DOWNSAMPLING,
     };
     let [color, features] = [&small.color, &small.features].map(|planes| padding.pad(planes));
     let large = Frame::new("large", 32, 64, color, features);

@@ -14,7 +14,6 @@ mod energy;
 
 use demc_data::check::geometry;
 use demc_data::image::frame::{FEATURE_NAMES, MAX_ALBEDO, POSITIONS, TEXTURES};
-use demc_data::input::ranges::exposure;
 use demc_data::input::transform::MAX_INPUT_SCALE;
 use demc_data::{Frame, FrameSummary};
 
@@ -51,7 +50,8 @@ impl Bundle {
             let named = |warning: &Warning| known.iter().any(|what| warning.what.contains(what));
             warnings.extend(drift.into_iter().filter(|warning| !named(warning)));
         }
-        warnings.extend(self.beyond_scale(exposure(&frame.color)));
+        let exposure = self.exposure(&frame.color, frame.height, frame.width);
+        warnings.extend(self.beyond_scale(exposure));
         Ok(warnings)
     }
 
@@ -74,6 +74,7 @@ impl Bundle {
     ///
     /// Normals and positions count only where the mask reports a hit, and albedo up to 1, as in the
     /// statistics.
+    /// Features that the network does not take do not count.
     /// [`denoise`](Self::denoise) starts with this check.
     ///
     /// # Errors
@@ -85,7 +86,11 @@ impl Bundle {
         let planes = frame.features.chunks_exact(pixels).enumerate();
         // Mapped positions cannot be far.
         let mapped = !self.meta.normalizer.position.is_scene();
-        for (i, plane) in planes.filter(|(i, _)| !(mapped && (POSITIONS..TEXTURES).contains(i))) {
+        let counts = |i: &usize| {
+            let cannot_be_far = mapped && (POSITIONS..TEXTURES).contains(i);
+            self.meta.model.takes_feature(*i) && !cannot_be_far
+        };
+        for (i, plane) in planes.filter(|(i, _)| counts(i)) {
             let mask = frame.mask.as_deref().filter(|_| i < TEXTURES);
             let largest = if i < TEXTURES { f32::MAX } else { MAX_ALBEDO };
             let (mean, std) = (stats.mean[i], stats.std[i]);

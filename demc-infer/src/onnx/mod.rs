@@ -29,6 +29,8 @@ mod kernel_head;
 mod kpcn;
 mod network;
 mod proto;
+mod transfer;
+mod unet;
 
 use std::fs;
 use std::io::Write;
@@ -36,6 +38,7 @@ use std::path::Path;
 
 use demc_data::InputKind;
 use demc_data::image::frame::FEATURE_NAMES;
+use demc_model::Variant;
 use demc_model::config::FEATURE_CHANNELS;
 
 use crate::bundle::Description;
@@ -107,8 +110,26 @@ struct Texts {
     documentation: &'static str,
 }
 
+const UNET_DOCUMENTATION: &str = "The U-Net of Open Image Denoise. \
+    color [batch, 3, height, width] is noisy radiance in linear HDR, times a factor s; divide the output by s. \
+    s is normalizer.exposure_level / the geometric mean of the luminance of the image's 16x16 pixels. \
+    features [batch, 12, height, width] are shading normal xyz, world position xyz, and albedo RGB at the \
+    first and at the second intersection. Of these, the guides of the model in the metadata count: the first albedo, \
+    and the normal. output [batch, 3, height, width] is radiance in linear HDR. \
+    Height and width must be multiples of 16: append rows and columns of color 0, albedo 0, and normal -1, and \
+    crop the output. Values must be finite. \
+    Metadata: `demc` holds model, statistics, channel names and training step as JSON, `demc.features` the \
+    order of the features.";
+
 impl Texts {
     fn of(bundle: &Bundle) -> Self {
+        if bundle.meta.model.variant == Variant::Unet {
+            return Self {
+                color: "radiance, linear HDR",
+                features: FEATURE_NAMES,
+                documentation: UNET_DOCUMENTATION,
+            };
+        }
         match bundle.meta.layout.inputs {
             InputKind::Demc => Self {
                 color: "radiance, linear HDR",

@@ -6,9 +6,8 @@
 
 use burn::nn::BatchNorm;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
-use demc_data::Normalizer;
-use demc_data::image::frame::MAX_ALBEDO;
-use demc_data::image::frame::TEXTURES;
+use demc_data::image::frame::{MAX_ALBEDO, POSITIONS, TEXTURES};
+use demc_data::{Normalizer, Transfer};
 use demc_model::config::{COLOR_CHANNELS, FEATURE_CHANNELS, Input};
 use demc_model::decoder::DecoderLevel;
 use demc_model::denoiser::Body;
@@ -27,18 +26,20 @@ pub const COLOR: &str = "color";
 pub const FEATURES: &str = "features";
 /// Name of the output.
 pub const OUTPUT: &str = "output";
+
 impl GraphBuilder {
     pub(super) fn denoise(&mut self, model: &Denoiser, normalizer: &Normalizer) {
         match &model.body {
             Body::DualEncoder(network) => self.dual_encoder(network, normalizer),
             Body::Kpcn(networks) => self.kpcn(networks),
+            Body::Unet(network) => self.unet(network, normalizer),
         }
     }
 
     fn dual_encoder(&mut self, model: &DualEncoder, normalizer: &Normalizer) {
-        let features = self.albedo_clamped();
+        let features = self.clamped_features(normalizer);
         let modulation = self.modulation(normalizer, &features);
-        let color_gamma = self.color_gamma(normalizer.gamma, modulation.as_ref());
+        let color_gamma = self.compressed(normalizer, modulation.as_ref());
         let features_z = self.features_z(normalizer, &features);
         let detail = model.fusion.as_ref().map(|fusion| {
             let blocks = fusion.blocks.iter();
@@ -85,17 +86,27 @@ impl GraphBuilder {
         if let Some(modulation) = &modulation {
             image = self.node("Mul", "output_modulated", &[&image, modulation], &[]);
         }
-        let gamma = self.constant("gamma", &[], &[normalizer.gamma]);
-        self.node("Pow", OUTPUT, &[&image, &gamma], &[]);
+        self.expanded(normalizer, &image);
     }
 
-    /// The features with albedo of at most [`MAX_ALBEDO`].
-    fn albedo_clamped(&mut self) -> Value {
+    /// The features in the range of [`Normalizer::features_z_from_raw`].
+    pub(super) fn clamped_features(&mut self, normalizer: &Normalizer) -> Value {
         let mut limits = [f32::MAX; FEATURE_CHANNELS];
         limits[TEXTURES..].fill(MAX_ALBEDO);
+        if normalizer.transfer == Transfer::Pu {
+            limits[..POSITIONS].fill(1.0);
+        }
         let most = self.constant("features_max", &[1, FEATURE_CHANNELS, 1, 1], &limits);
         let raw = Value(FEATURES.into());
-        self.node("Min", "features_clamped", &[&raw, &most], &[])
+        if normalizer.transfer == Transfer::Gamma {
+            return self.node("Min", "features_clamped", &[&raw, &most], &[]);
+        }
+        let mut least = [f32::MIN; FEATURE_CHANNELS];
+        least[..POSITIONS].fill(-1.0);
+        least[TEXTURES..].fill(0.0);
+        let least = self.constant("features_min", &[1, FEATURE_CHANNELS, 1, 1], &least);
+        let above = self.node("Min", "features_below", &[&raw, &most], &[]);
+        self.node("Max", "features_clamped", &[&above, &least], &[])
     }
 
     /// `(clamp(albedo, 0, 1) + epsilon)^(1/gamma)` with the albedo of the first hit
@@ -117,19 +128,8 @@ impl GraphBuilder {
         Some(self.node("Pow", "modulation", &[&divisor, &exponent], &[]))
     }
 
-    /// `max(x, 0)^(1/gamma)` (Eq. 4), divided by the modulation.
-    fn color_gamma(&mut self, gamma: f32, modulation: Option<&Value>) -> Value {
-        let exponent = self.constant("inverse_gamma", &[], &[1.0 / gamma]);
-        let positive = self.node("Relu", "color_positive", &[&Value(COLOR.into())], &[]);
-        let color = self.node("Pow", "color_gamma", &[&positive, &exponent], &[]);
-        match modulation {
-            Some(modulation) => self.node("Div", "color_demodulated", &[&color, modulation], &[]),
-            None => color,
-        }
-    }
-
     /// `(x - mean) / std`, channel by channel.
-    fn features_z(&mut self, normalizer: &Normalizer, features: &Value) -> Value {
+    pub(super) fn features_z(&mut self, normalizer: &Normalizer, features: &Value) -> Value {
         let shape = [1, FEATURE_CHANNELS, 1, 1];
         let mean = self.constant("features_mean", &shape, &normalizer.features.mean);
         let std = self.constant("features_std", &shape, &normalizer.features.std);
@@ -157,14 +157,17 @@ impl GraphBuilder {
                 skip = Some(x.clone());
             }
         }
+        let below = level.pooled.then(|| self.pooled(&x));
+        (skip.expect("a level has a skip"), below)
+    }
+
+    /// The maximum of each 2x2 window.
+    pub(super) fn pooled(&mut self, x: &Value) -> Value {
         let settings = [
             ("kernel_shape", AttributeValue::Ints(&[2, 2])),
             ("strides", AttributeValue::Ints(&[2, 2])),
         ];
-        let below = level
-            .pooled
-            .then(|| self.node("MaxPool", &format!("{}.pool", x.0), &[&x], &settings));
-        (skip.expect("a level has a skip"), below)
+        self.node("MaxPool", &format!("{}.pool", x.0), &[x], &settings)
     }
 
     /// Adds a level of the decoder: `[decoder | skips]`, fused (Eq. 2).

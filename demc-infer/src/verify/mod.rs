@@ -1,5 +1,5 @@
-//! Verifies an exported file: Python runs it on synthetic frames, in ONNX Runtime or PyTorch, and
-//! the output is compared with this program's.
+//! Verifies an exported file: Python runs it on synthetic frames, in ONNX Runtime, PyTorch, or Open Image
+//! Denoise, and the output is compared with this program's.
 
 use std::fs;
 use std::io::Write;
@@ -9,6 +9,7 @@ use std::process::{Command, Output, Stdio};
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_data::image::frame::FEATURES;
 use demc_data::{FeatureStats, Frame, InputKind};
+use demc_model::unet::Guides;
 use demc_model::{Denoiser, Head};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -24,6 +25,8 @@ pub const TOLERANCE: f32 = 1e-4;
 pub const KERNEL_TOLERANCE: f32 = 1e-3;
 /// Images, height and width of the compared batches: square and not, one image and two.
 pub const SIZES: [[usize; 3]; 4] = [[1, 32, 32], [1, 96, 160], [2, 224, 32], [1, 256, 256]];
+/// The same for Open Image Denoise, which takes images of any size.
+const OIDN_SIZES: [[usize; 3]; 4] = [[1, 32, 32], [1, 201, 183], [2, 16, 250], [1, 256, 256]];
 /// Epsilon of RelMSE (Eq. 5).
 const RELMSE_EPSILON: f32 = 0.001;
 const SEED: u64 = 20190101;
@@ -45,15 +48,26 @@ pub enum Runtime {
     OnnxRuntime,
     /// PyTorch with the package of `bindings/python/`, for a bundle.
     PyTorch,
+    /// Open Image Denoise, for a TZA file.
+    Oidn,
 }
 
 impl Runtime {
+    /// Images, height and width of the batches for it.
+    fn sizes(self) -> [[usize; 3]; 4] {
+        match self {
+            Runtime::OnnxRuntime | Runtime::PyTorch => SIZES,
+            Runtime::Oidn => OIDN_SIZES,
+        }
+    }
+
     /// The script's name of the runtime, and the packages for `pip install`; `./bindings/python` is in this
     /// project's repository.
     fn name_and_packages(self) -> [&'static str; 2] {
         match self {
             Runtime::OnnxRuntime => ["onnx", "numpy onnxruntime"],
             Runtime::PyTorch => ["torch", "'./bindings/python[torch]'"],
+            Runtime::Oidn => ["oidn", "numpy pyoidn"],
         }
     }
 }
@@ -109,7 +123,7 @@ impl Deviation {
 pub struct Verification {
     /// Name and version of the runtime.
     pub runtime: String,
-    /// One deviation per entry of [`SIZES`].
+    /// One deviation per batch.
     pub deviations: Vec<Deviation>,
 }
 
@@ -161,8 +175,9 @@ pub fn verify(
 ) -> Result<Verification, VerifyError> {
     let folder = tempfile::tempdir()?;
     let mut rng = ChaCha8Rng::seed_from_u64(SEED);
-    let mut outputs = Vec::with_capacity(SIZES.len());
-    for (i, size) in SIZES.into_iter().enumerate() {
+    let sizes = runtime.sizes();
+    let mut outputs = Vec::with_capacity(sizes.len());
+    for (i, size) in sizes.into_iter().enumerate() {
         let batch = match expected.meta.layout.inputs {
             InputKind::Demc => SyntheticBatch::of_frames(size, runtime, expected, &mut rng)?,
             InputKind::Kpcn => SyntheticBatch::of_light(size, &expected.model, &mut rng),
@@ -174,9 +189,10 @@ pub fn verify(
         outputs.push(batch.output);
     }
     let head = expected.meta.model.head;
-    let runtime = run(file, runtime, python, folder.path())?;
-    let mut deviations = Vec::with_capacity(SIZES.len());
-    for ((i, size), expected) in SIZES.into_iter().enumerate().zip(outputs) {
+    let guides = expected.meta.model.guides();
+    let runtime = run(file, runtime, guides, python, folder.path())?;
+    let mut deviations = Vec::with_capacity(sizes.len());
+    for ((i, size), expected) in sizes.into_iter().enumerate().zip(outputs) {
         // A program that is no Python interpreter writes nothing.
         let bytes = fs::read(folder.path().join(format!("{i}.output"))).unwrap_or_default();
         let words = bytes.as_chunks().0.iter();
@@ -197,7 +213,13 @@ pub fn verify(
 }
 
 /// Runs the file on the folder's inputs. Returns name and version of the runtime.
-fn run(file: &Path, runtime: Runtime, python: &Path, folder: &Path) -> Result<String, VerifyError> {
+fn run(
+    file: &Path,
+    runtime: Runtime,
+    guides: Guides,
+    python: &Path,
+    folder: &Path,
+) -> Result<String, VerifyError> {
     let [kind, packages] = runtime.name_and_packages();
     let start = |source| VerifyError::Python {
         python: python.into(),
@@ -211,10 +233,16 @@ fn run(file: &Path, runtime: Runtime, python: &Path, folder: &Path) -> Result<St
         .stderr(Stdio::piped())
         .spawn()
         .map_err(start)?;
-    let sizes = format!("{SIZES:?}");
+    let guides: &[&str] = match guides {
+        Guides::None => &[],
+        Guides::Albedo => &["albedo"],
+        Guides::AlbedoNormal => &["albedo", "normal"],
+    };
+    let sizes = runtime.sizes();
+    let request = format!("{{\"sizes\": {sizes:?}, \"guides\": {guides:?}}}");
     if let Some(mut stdin) = child.stdin.take() {
         // If Python has already ended, its exit code and output tell why.
-        let _ = stdin.write_all(sizes.as_bytes());
+        let _ = stdin.write_all(request.as_bytes());
     }
     let Output {
         status,
@@ -262,7 +290,7 @@ impl SyntheticBatch {
             let frame = synthetic_frame([height, width], statistics, rng);
             output.extend(match runtime {
                 Runtime::OnnxRuntime => expected.run_graph(&frame)?,
-                Runtime::PyTorch => expected.denoise(&frame)?,
+                Runtime::PyTorch | Runtime::Oidn => expected.denoise(&frame)?,
             });
             color.extend(frame.color);
             features.extend(frame.features);

@@ -1,4 +1,4 @@
-//! Tests with the inputs of `tests/fuzz/` for bundles: valid seeds, and findings that once caused a
+//! Tests with the inputs of `tests/fuzz/` for bundles and TZA files: valid seeds, and findings that once caused a
 //! failure.
 
 use std::collections::HashMap;
@@ -99,5 +99,16 @@ fn a_path_to_no_regular_file_is_refused_at_once() {
             .expect("a reason")
             .to_string();
         assert_eq!(source, "not a regular file");
+    }
+}
+
+/// The seeds have too few tensors for a network.
+#[test]
+fn every_seed_and_finding_in_a_tza_file_is_a_one_line_error() {
+    let files = [inputs("seeds/tza"), inputs("findings/tza")].concat();
+    assert!(files.len() >= 3);
+    for (path, bytes) in files {
+        let error = demc_infer::tza::parse(&path, &bytes).expect_err("no network");
+        assert!(!error.to_string().contains('\n'), "{error}");
     }
 }

@@ -1,4 +1,5 @@
 use super::*;
+use crate::unet::{Guides, UnetSize};
 
 #[test]
 fn names_in_configurations_are_those_of_the_tables() {
@@ -15,9 +16,9 @@ fn names_in_configurations_are_those_of_the_tables() {
 #[test]
 fn only_variants_with_a_detail_map_have_a_fusion() {
     let has_fusion = Variant::ALL.map(|variant| variant.spec().has_fusion());
-    assert_eq!(has_fusion, [true, false, true, false, false]);
+    assert_eq!(has_fusion, [true, false, true, false, false, false]);
     let takes_features = Variant::ALL.map(|variant| variant.spec().takes_features());
-    assert_eq!(takes_features, [true, true, true, false, true]);
+    assert_eq!(takes_features, [true, true, true, false, true, true]);
 }
 
 #[test]
@@ -53,6 +54,23 @@ fn keys_of_encoders_are_a_problem_of_kpcn() {
     let head = Head::Kernel;
     let problems = ModelConfig { head, ..kpcn }.validate();
     assert!(problems.len() == 1 && problems[0].contains("kpcn"));
+}
+
+#[test]
+fn keys_of_other_variants_are_a_problem_of_a_unet_and_its_own_of_others() {
+    let unet = ModelConfig {
+        variant: Variant::Unet,
+        size: Some(UnetSize::Large),
+        guides: Some(Guides::Albedo),
+        ..ModelConfig::default()
+    };
+    assert_eq!(unet.validate(), Vec::<String>::new());
+    assert_eq!(unet.to_string(), "unet, large, guides albedo");
+    let problems = ModelConfig { width: 32, ..unet }.validate();
+    assert!(problems.len() == 1 && problems[0].contains("width"));
+    let variant = Variant::Demc;
+    let problems = ModelConfig { variant, ..unet }.validate();
+    assert!(problems.len() == 1 && problems[0].contains("size and guides"));
 }
 
 #[test]

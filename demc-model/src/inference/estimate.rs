@@ -4,7 +4,8 @@ use demc_kernels::{Grid, memory};
 
 use super::encoder::DEEPEST_BANDED;
 use super::full_resolution::UPPER_LEVELS;
-use super::pass::BandPlan;
+use super::pass::{BandPlan, TILE_VALUES, VALUE, WAITING_ROWS};
+use super::unet_estimate::unet_bytes;
 use crate::config::{
     COLOR_CHANNELS, DETAIL_CHANNELS, FEATURE_CHANNELS, Head, Input, LEVELS, ModelConfig, Variant,
     channels_of,
@@ -13,20 +14,11 @@ use crate::kernel_head::{KERNEL_LEVELS, logits};
 use crate::kpcn;
 use crate::ops::Ops;
 
-const VALUE: usize = size_of::<f32>();
-
-/// Values of a transformed Winograd tile, F(4x4, 3x3).
-const TILE_VALUES: usize = 36;
-
 const TILE_PIXELS: usize = 16;
 
 /// Largest number of tiles that a thread transforms at a time where weights, and so this memory,
 /// are large.
 const TILES: usize = 96;
-
-/// Rows that a convolution keeps for the next band, and that the last band of a chain has beside
-/// its own.
-const WAITING_ROWS: usize = 5;
 
 /// Values that Burn's operations hold at a time per value of the largest map. Measured: 7 to 8 on
 /// `flex` with width 16, the paper's levels and images from 256x256 to 1280x720.
@@ -42,8 +34,15 @@ pub fn pass_bytes(
     width: usize,
     layers: usize,
 ) -> u64 {
-    if config.variant == Variant::Kpcn {
-        return kpcn_bytes(config, height * width);
+    match config.variant {
+        Variant::Kpcn => return kpcn_bytes(config, height * width),
+        Variant::Unet if ops.has_fast_inference() => return unet_bytes(config, height, width),
+        Variant::Unet => {
+            let [.., [_, below], _] = config.unet_size().spec().decoder;
+            let channels = below + config.guides().channels();
+            return BURN_VALUES * (channels * height * width * VALUE) as u64;
+        }
+        _ => (),
     }
     if ops.has_fast_inference() {
         return peak_bytes(config, height, width, layers);

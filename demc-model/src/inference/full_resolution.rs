@@ -257,7 +257,7 @@ impl OutputRows<'_> {
 }
 
 /// Writes rows of an image's colours, channels last, into its planes.
-fn write_rows(planar: &mut [f32], grid: Grid, rows: Range<usize>, colors: &[f32]) {
+pub(super) fn write_rows(planar: &mut [f32], grid: Grid, rows: Range<usize>, colors: &[f32]) {
     let planes = planar.chunks_exact_mut(grid.height * grid.width);
     for (channel, plane) in planes.enumerate() {
         let plane = &mut plane[rows.start * grid.width..rows.end * grid.width];

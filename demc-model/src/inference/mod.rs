@@ -26,6 +26,8 @@ mod kernel_head;
 mod pass;
 #[cfg(test)]
 mod tests;
+mod unet;
+mod unet_estimate;
 mod watch;
 
 use burn::backend::Flex;
@@ -48,6 +50,7 @@ use watch::Watch;
 
 pub use estimate::{pass_bytes, peak_bytes, reusable_bytes};
 pub use folded::{FoldedConv, norm_scale};
+pub(crate) use unet::forward as forward_unet;
 pub use watch::{Cancelled, Observer};
 
 pub(crate) fn forward(

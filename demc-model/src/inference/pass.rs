@@ -9,6 +9,16 @@ use super::folded::FoldedConv;
 use super::watch::Watch;
 use crate::dual_encoder::DualEncoder;
 
+/// Rows that a convolution keeps for the next band, and that the last band of a chain has beside
+/// its own.
+pub(super) const WAITING_ROWS: usize = 5;
+
+/// Bytes of a value.
+pub(super) const VALUE: usize = size_of::<f32>();
+
+/// Values of a transformed Winograd tile, F(4x4, 3x3).
+pub(super) const TILE_VALUES: usize = 36;
+
 /// Pixels of the full resolution in a band, per thread: enough work for a thread, little enough for
 /// caches.
 const BAND_PIXELS: usize = 20 << 10;

@@ -233,6 +233,26 @@ impl Maps {
         Maps { tensor, ..self }
     }
 
+    /// These maps doubled by repeating pixels, then the channels of `skip`.
+    ///
+    /// # Shapes
+    /// `[B, C, H, W]` and `[B, K, 2H, 2W]` to `[B, C + K, 2H, 2W]`.
+    pub fn double_and_append(self, skip: Maps) -> Self {
+        let tensor = match self.ops {
+            Ops::Kernels => kernels::double_and_append(self.tensor, skip.tensor),
+            Ops::Burn => {
+                let [batch, channels, height, width] = self.tensor.dims();
+                let repeated: Tensor<6> = self
+                    .tensor
+                    .reshape([batch, channels, height, 1, width, 1])
+                    .expand([batch, channels, height, 2, width, 2]);
+                let doubled = repeated.reshape([batch, channels, 2 * height, 2 * width]);
+                Tensor::cat(vec![doubled, skip.tensor], 1)
+            }
+        };
+        Maps { tensor, ..self }
+    }
+
     /// The first image, and the others.
     ///
     /// # Shapes

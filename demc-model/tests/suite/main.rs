@@ -9,6 +9,7 @@ mod memory;
 mod network;
 mod ops;
 mod ops_network;
+mod unet;
 
 use demc_kernels::memory::Recycler;
 

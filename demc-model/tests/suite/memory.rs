@@ -37,6 +37,7 @@ fn check() {
         (Variant::Demc, Reading::Released, 24, PAPER, [768, 1024], 0),
         (Variant::Semc, Reading::Paper, 32, PAPER, [736, 1280], 0),
         (Variant::Kpcn, Reading::Paper, 32, PAPER, [256, 512], 0),
+        (Variant::Unet, Reading::Paper, 64, PAPER, [1088, 1920], 0),
         (Variant::Demc, Reading::Paper, 32, PAPER, [1088, 1920], 0),
         (
             Variant::ColorOnly,

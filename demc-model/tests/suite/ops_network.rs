@@ -193,6 +193,10 @@ fn kernels_agree_with_burns_operations_on_every_network() {
         ..config(Variant::Demc, Reading::Paper)
     });
     check(config(Variant::Kpcn, Reading::Paper));
+    check(ModelConfig {
+        variant: Variant::Unet,
+        ..ModelConfig::default()
+    });
 }
 
 #[test]

@@ -202,6 +202,9 @@ impl Config {
                 self.data.gamma
             ));
         }
+        if self.model.head == Head::Kernel && !self.data.transfer.is_gamma() {
+            problems.push("data.transfer: must be \"gamma\" for model.head = \"kernel\"".into());
+        }
         if self.model.variant == Variant::Kpcn {
             problems.extend(self.kpcn_problems());
         } else if self.loss.separate != 0.0 {
@@ -235,6 +238,7 @@ impl Config {
                 "data.augment: of `rgb`, `axes`, and `noise`, each",
             ),
             (data.dropout.is_off(), "data.dropout"),
+            (data.transfer.is_gamma(), "data.transfer"),
             (
                 data.albedo_demodulation_epsilon.is_none(),
                 "data.albedo_demodulation_epsilon",

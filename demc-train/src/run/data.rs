@@ -40,6 +40,8 @@ pub struct TrainingData {
     pub normalizer: Normalizer,
     /// Ranges of [`Self::train`], and of the scenes that initial weights were trained on.
     pub ranges: Ranges,
+    /// The licence of the initial weights, if they come from another program.
+    pub license: Option<String>,
     /// Which buffers training drops, so that files may lack them.
     pub dropout: Dropout,
     /// SHA-256 of each scene's file, by the scene's name.
@@ -203,6 +205,7 @@ impl TrainingData {
             validation,
             test,
             normalizer: statistics.normalizer,
+            license: None,
             ranges: if config.data.augment.axes {
                 statistics.ranges.in_any_axes()
             } else {
@@ -265,8 +268,12 @@ impl TrainingData {
     pub fn meta(&self, model: ModelConfig, step: u64) -> BundleMeta {
         let mut layout = self.layout.clone();
         layout.missing = layout.missing.or(self.dropout.missing());
-        BundleMeta::new(model, self.normalizer.clone(), layout, step)
-            .with_ranges(self.ranges.clone())
+        let meta = BundleMeta::new(model, self.normalizer.clone(), layout, step)
+            .with_ranges(self.ranges.clone());
+        match &self.license {
+            Some(license) => meta.with_license(license),
+            None => meta,
+        }
     }
 
     /// `10 training scenes, 2 validation scenes, 4 test scenes`

@@ -39,9 +39,22 @@ pub struct InitialWeights {
     /// The ranges of the scenes of that run, if the file contains them.
     #[serde(skip)]
     pub ranges: Option<Ranges>,
+    /// Their licence, if they come from another program.
+    #[serde(skip)]
+    pub license: Option<String>,
 }
 
+/// The notice of changes that Apache-2.0 asks for.
+const CHANGED: &str = "; changed by training";
+
 impl InitialWeights {
+    /// The licence of weights that are trained from these.
+    pub(super) fn license_of_changed(&self) -> Option<String> {
+        let license = self.license.as_deref()?;
+        let unchanged = license.strip_suffix(CHANGED).unwrap_or(license);
+        Some(format!("{unchanged}{CHANGED}"))
+    }
+
     /// A note for the user on these weights in a run of `config`.
     pub fn note(&self, config: &Config) -> String {
         let InitialWeights { file, step, .. } = self;
@@ -93,6 +106,7 @@ pub fn initial_network(
         step: file.meta.step,
         albedo_demodulation_epsilon: file.meta.normalizer.albedo_demodulation_epsilon,
         ranges: file.meta.ranges.clone(),
+        license: file.meta.license.clone(),
     };
     let Bundle {
         model,
@@ -109,8 +123,8 @@ pub fn initial_network(
 /// The file of `train.init`, if it is set.
 ///
 /// # Errors
-/// A file without a network; a network that differs from `[model]` or `data.gamma`, with each
-/// differing key; an albedo filter with another `data.position`.
+/// A file without a network; a network that differs from `[model]`, `data.gamma`, or `data.transfer`,
+/// with each differing key; an albedo filter with another `data.position`.
 pub fn read_init(config: &Config) -> anyhow::Result<Option<BundleFile>> {
     let Some(init) = &config.train.init else {
         return Ok(None);
@@ -129,6 +143,7 @@ pub fn read_init(config: &Config) -> anyhow::Result<Option<BundleFile>> {
         ..file.meta.model
     };
     saved.data.gamma = file.meta.normalizer.gamma;
+    saved.data.transfer = file.meta.normalizer.transfer;
     let differences = config.differences(&saved);
     ensure!(
         differences.is_empty(),

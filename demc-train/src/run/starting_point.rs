@@ -39,6 +39,9 @@ impl StartingPoint {
         if let Some(before) = before {
             data.ranges = data.ranges.with(before);
         }
+        data.license = weights
+            .as_ref()
+            .and_then(InitialWeights::license_of_changed);
         Ok(StartingPoint {
             model,
             albedo_filter,
@@ -65,6 +68,7 @@ impl StartingPoint {
         if let Some(ranges) = &bundle.meta.ranges {
             data.ranges = ranges.clone();
         }
+        data.license = bundle.meta.license.clone();
         ensure!(
             bundle.meta == data.meta(config.model, state.step),
             "{}: network, layout or statistics of the checkpoint differ from this run's",

@@ -5,3 +5,4 @@ pub mod gradients;
 pub mod optimizer;
 mod running_statistics;
 pub mod trainer;
+mod transfer;

@@ -4,7 +4,7 @@
 use burn::module::Module;
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
-use demc_data::{Batch, FEATURES, Patch, Scene};
+use demc_data::{Batch, FEATURES, Patch, Scene, Transfer};
 use demc_model::{Denoiser, LossConfig, kpcn};
 use serde::{Deserialize, Serialize};
 
@@ -15,6 +15,7 @@ use crate::step::ema::Ema;
 use crate::step::gradients::{grad_norm, scaled};
 use crate::step::optimizer::{DORMANT_STEPS, DormantChannels, Optimizer};
 use crate::step::running_statistics::RunningStatistics;
+use crate::step::transfer::in_gamma;
 
 /// Largest number of patches named in a message.
 const MAX_NAMED: usize = 8;
@@ -33,6 +34,7 @@ pub struct Trainer {
     grad_accumulation: usize,
     max_grad_norm: Option<f32>,
     gamma: f32,
+    transfer: Transfer,
     reduce: Reduce,
 }
 
@@ -130,6 +132,7 @@ impl Trainer {
             grad_accumulation: config.train.grad_accumulation,
             max_grad_norm: config.optimizer.max_grad_norm,
             gamma: config.data.gamma,
+            transfer: config.data.transfer,
             reduce: Reduce::default(),
         }
     }
@@ -326,7 +329,7 @@ impl Trainer {
             }
             (Some(_), Some(divisor)) => kpcn::joined_gamma(out, divisor, self.gamma),
             (_, Some(modulation)) => out * modulation,
-            (_, None) => out,
+            (_, None) => in_gamma(out, self.transfer, self.gamma),
         };
         self.loss
             .per_image(self.model().ops(), out_gamma, ref_hdr, self.gamma)

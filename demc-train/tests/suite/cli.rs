@@ -105,7 +105,7 @@ fn invalid_configurations_exit_with_2_and_one_line() {
     let (dir, config, run) = place();
     let error = |set: &str| error_line(&train(&config, &run, &["--set", set]), 2);
     assert!(error("train.step=3").contains("did you mean `train.steps`?"));
-    assert!(error("model.variant=unet").contains("demc-nosn"));
+    assert!(error("model.variant=resnet").contains("demc-nosn"));
     let all = error_line(
         &train(
             &config,

@@ -8,9 +8,10 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use burn::tensor::Device;
-use demc_data::{ChannelLayout, FeatureStats, Normalizer, PositionSpace};
+use demc_data::{ChannelLayout, FeatureStats, Normalizer, PositionSpace, Transfer};
 use demc_infer::{Bundle, BundleMeta};
 use demc_model::config::LEVEL_WIDTHS;
+use demc_model::unet::UnetSize;
 use demc_model::{Head, ModelConfig, Reading, Variant, Weight, Weights};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -136,6 +137,7 @@ pub fn random_bundle(
             Reading::Released => Some(1.0),
         },
         position: PositionSpace::Scene,
+        transfer: Transfer::Gamma,
         exposure_level: None,
         restore_light: false,
         features: FeatureStats {
@@ -163,6 +165,38 @@ pub fn random_kpcn(rng: &mut ChaCha8Rng) -> Bundle {
     let BundleMeta {
         normalizer, layout, ..
     } = random.meta;
+    Bundle::new(BundleMeta::new(model, normalizer, layout, 0), network)
+}
+
+/// The U-Net of Open Image Denoise with random weights.
+pub fn random_unet(rng: &mut ChaCha8Rng) -> Bundle {
+    let random = random_bundle(Variant::DemcNosn, Reading::Released, 0.0..0.1, rng);
+    let model = ModelConfig {
+        variant: Variant::Unet,
+        size: Some(UnetSize::Small),
+        ..ModelConfig::default()
+    };
+    let network = model.init(rng, [0.0; 3], &Device::flex());
+    let mut weights = network.weights();
+    for Weight { name, data, .. } in &mut weights {
+        // The image is not black, and its radiance not beyond floats.
+        if name.starts_with("head.") {
+            data.iter_mut()
+                .for_each(|value| *value = 0.1 * value.abs() + 1e-3);
+        }
+    }
+    let network = model.load(&mut Weights::new(weights), &Device::flex());
+    let BundleMeta {
+        normalizer, layout, ..
+    } = random.meta;
+    let normalizer = Normalizer {
+        transfer: Transfer::Pu,
+        albedo_demodulation_epsilon: None,
+        exposure_level: Some(0.18),
+        features: normalizer.features.clone().with_ranges_of(Transfer::Pu),
+        ..normalizer
+    };
+    let network = network.expect("its own weights");
     Bundle::new(BundleMeta::new(model, normalizer, layout, 0), network)
 }
 

@@ -4,6 +4,7 @@ mod backends;
 mod fixture;
 mod live;
 mod metrics;
+mod oidn_live;
 mod onnx_live;
 mod parity;
 mod parity_live;

@@ -8,7 +8,7 @@ use std::fs;
 use std::path::Path;
 
 use crate::live::{
-    FEATURES, Python, random_bundle, random_kpcn, read_floats, uniform, write_floats,
+    FEATURES, Python, random_bundle, random_kpcn, random_unet, read_floats, uniform, write_floats,
 };
 use crate::tensors::{Tolerance, assert_close};
 use burn::tensor::Device;
@@ -88,14 +88,15 @@ fn onnx_runtime_computes_what_this_program_does() {
     for (name, bundle) in &bundles {
         compare(folder, name, bundle, &frames, seed);
     }
-    let kpcn = random_kpcn(&mut rng);
-    let file = folder.join("kpcn.onnx");
-    for (precision, _) in PRECISIONS {
-        kpcn.export_onnx(&file, precision).expect("exported");
-        let expected = kpcn.rounded(precision).expect("rounded");
-        let found = verify(&file, Runtime::OnnxRuntime, python.path(), &expected);
-        let found = found.expect("it runs");
-        assert!(found.deviations.iter().all(Deviation::passes), "{found:?}");
+    let file = folder.join("network.onnx");
+    for bundle in [random_kpcn(&mut rng), random_unet(&mut rng)] {
+        for (precision, _) in PRECISIONS {
+            bundle.export_onnx(&file, precision).expect("exported");
+            let expected = bundle.rounded(precision).expect("rounded");
+            let found = verify(&file, Runtime::OnnxRuntime, python.path(), &expected);
+            let found = found.expect("it runs");
+            assert!(found.deviations.iter().all(Deviation::passes), "{found:?}");
+        }
     }
 }
 

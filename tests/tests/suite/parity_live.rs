@@ -8,7 +8,7 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-use crate::live::{FEATURES, Python, random_bundle, random_kpcn, uniform};
+use crate::live::{FEATURES, Python, random_bundle, random_kpcn, random_unet, uniform};
 use crate::tensors::{Tolerance, assert_close, read};
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_infer::verify::{Deviation, Runtime, verify};
@@ -44,12 +44,13 @@ fn pytorch_loads_every_export_strictly_and_agrees() {
         }
     }
     let mut rng = ChaCha8Rng::seed_from_u64(rand::random());
-    let kpcn = random_kpcn(&mut rng);
-    let file = tempfile::NamedTempFile::new().expect("a file");
-    let saved = kpcn.save(file.path(), Names::Torch, Precision::F32);
-    saved.expect("the bundle is written");
-    let found = verify(file.path(), Runtime::PyTorch, python.path(), &kpcn).expect("it runs");
-    assert!(found.deviations.iter().all(Deviation::passes), "{found:?}");
+    for bundle in [random_kpcn(&mut rng), random_unet(&mut rng)] {
+        let file = tempfile::NamedTempFile::new().expect("a file");
+        let saved = bundle.save(file.path(), Names::Torch, Precision::F32);
+        saved.expect("the bundle is written");
+        let found = verify(file.path(), Runtime::PyTorch, python.path(), &bundle).expect("it runs");
+        assert!(found.deviations.iter().all(Deviation::passes), "{found:?}");
+    }
     agrees(
         &python,
         Variant::Demc,

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .metrics import gamma_from_hdr, hdr_from_gamma, rel_mse
     from .kpcn import Kpcn
     from .network import Denoiser, ModelConfig
+    from .unet import Unet
 
 _MODULES = {
     "bundle": ["Bundle", "load"],
@@ -23,6 +24,8 @@ _MODULES = {
     "metrics": ["gamma_from_hdr", "hdr_from_gamma", "rel_mse"],
     "network": ["Denoiser", "ModelConfig"],
     "preprocess": [],
+    "transfer": [],
+    "unet": ["Unet"],
 }
 
 __all__ = [
@@ -31,6 +34,7 @@ __all__ = [
     "Frame",
     "Kpcn",
     "ModelConfig",
+    "Unet",
     "gamma_from_hdr",
     "hdr_from_gamma",
     "load",

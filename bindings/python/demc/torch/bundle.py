@@ -21,11 +21,12 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from torch.nn import functional as F
 
-from . import light, preprocess
-from .metrics import gamma_from_hdr, hdr_from_gamma
+from . import light, preprocess, transfer
 from .kpcn import Kpcn
-from .network import KPCN, Denoiser, ModelConfig
+from .metrics import gamma_from_hdr
+from .network import KPCN, UNET, Denoiser, ModelConfig
 from .preprocess import FEATURES, layer_color
+from .unet import Unet
 
 FORMAT = 1
 """The bundle format that this package reads."""
@@ -47,7 +48,7 @@ TORCH_FROM_BURN = {"gamma": "weight", "beta": "bias"}
 class Bundle:
     """A network in eval mode and the statistics of its training set."""
 
-    model: Denoiser | Kpcn
+    model: Denoiser | Kpcn | Unet
     gamma: float
     feature_mean: Tensor  # [12]
     feature_std: Tensor  # [12]
@@ -74,17 +75,21 @@ class Bundle:
     def features_z_from_raw(self, features: Tensor) -> Tensor:
         """[B, 12, H, W] features as rendered -> Z-scored."""
         shape = (1, FEATURES, 1, 1)
-        features = torch.cat((features[:, :6], features[:, 6:].clamp_max(MAX_ALBEDO)), 1)
+        normals, positions, albedo = features.split((3, 3, 6), 1)
+        albedo = albedo.clamp_max(MAX_ALBEDO)
+        if self.meta["normalizer"].get("transfer") == "pu":
+            normals, albedo = normals.clamp(-1, 1), albedo.clamp_min(0)
+        features = torch.cat((normals, positions, albedo), 1)
         return (features - self.feature_mean.view(shape)) / self.feature_std.view(shape)
 
     def radiance(self, color: Tensor, features: Tensor) -> Tensor:
         """The network between linear radiances, as the ONNX graph has it; differentiable.
 
         Prepared colour [B, 3, H, W] and features [B, 12, H, W] (`preprocess.prepare`) -> [B, 3, H, W].
-        Height and width are multiples of 32. An albedo filter runs first.
+        Height and width are multiples of 32, or of 16 for variant `unet`. An albedo filter runs first.
         """
         inputs, modulation = self._inputs(color, features)
-        return hdr_from_gamma(self.model(*inputs) * modulation, self.gamma)
+        return transfer.expand(self.model(*inputs) * modulation, self.meta["normalizer"])
 
     def radiance_with_layers(
         self, color: Tensor, features: Tensor, layers: Mapping[str, Tensor]
@@ -101,7 +106,7 @@ class Bundle:
         images = F.pad(planes, (0, 0, 0, 0, 0, -len(planes) % 3)).unflatten(0, (-1, 3))
         out, filtered = self.model.forward_with_layers(*inputs, images)
         filtered = filtered.flatten(0, 1)[: len(planes)] * albedo
-        return hdr_from_gamma(out * modulation, self.gamma), dict(zip(layers, filtered))
+        return transfer.expand(out * modulation, self.meta["normalizer"]), dict(zip(layers, filtered))
 
     def _inputs(self, color: Tensor, features: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """The network's inputs for prepared colour and features, and the modulation of its output."""
@@ -109,8 +114,8 @@ class Bundle:
             raise ValueError("kpcn takes diffuse and specular light: call `model` with them, or use demc-infer")
         features = self.with_filtered_albedo(features)
         modulation = self.modulation(features)
-        color_gamma = gamma_from_hdr(color, self.gamma) / modulation
-        return (color_gamma, self.features_z_from_raw(features)), modulation
+        compressed = transfer.compress(color, self.meta["normalizer"]) / modulation
+        return (compressed, self.features_z_from_raw(features)), modulation
 
     def with_filtered_albedo(self, features: Tensor) -> Tensor:
         """Prepared features [B, 12, H, W] with the albedo (first hit) that the network sees.
@@ -196,8 +201,8 @@ class Bundle:
         return image * factors, filtered
 
     def _padded(self, planes: np.ndarray) -> Tensor:
-        """Planes [C, H, W] on the network's device, padded to multiples of 32."""
-        return torch.from_numpy(preprocess.pad(planes)).to(next(self.model.parameters()).device)
+        """Colour, features, or layers [C, H, W] on the network's device, padded as the network needs."""
+        return torch.from_numpy(preprocess.pad(planes, self.meta)).to(next(self.model.parameters()).device)
 
     def to(self, device: torch.device | str) -> Bundle:
         """Moves the networks and the statistics to `device`, in place."""
@@ -261,7 +266,7 @@ def _network(path: str | os.PathLike, meta: Any, weights: dict[str, Tensor], *pa
     demodulate = meta["normalizer"].get("demodulate", 0.0)
     mean, std = (torch.tensor(entry("normalizer", "features", key)) for key in ("mean", "std"))
     config = ModelConfig(**entry("model"))
-    model = Kpcn(config) if config.variant == KPCN else Denoiser(config)
+    model = {KPCN: Kpcn, UNET: Unet}.get(config.variant, Denoiser)(config)
     try:
         model.load_state_dict(weights, strict=True)
     except RuntimeError as error:

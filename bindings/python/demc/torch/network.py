@@ -58,7 +58,9 @@ VARIANTS = {
     "color-only": Variant(fusion=False, encoders=(("color",),)),  # ours: a control
 }
 KPCN = "kpcn"
-"""The variant without encoders (`kpcn.Kpcn`)."""
+"""The networks of `kpcn.Kpcn`."""
+UNET = "unet"
+"""The network of `unet.Unet`."""
 CHANNELS = {"detail": 3, "color": 3, "features": FEATURES}
 
 
@@ -92,13 +94,17 @@ class ModelConfig:
     levels: tuple[int, ...] = LEVEL_FACTORS
     head: str = "grey"
     detail: str = "open"
+    size: str | None = None  # of a U-Net: small, base, or large
+    guides: str | None = None  # of a U-Net: none, albedo, or albedo-normal
 
     def __post_init__(self) -> None:
         for what, value, known in (
-            ("variant", self.variant, (*VARIANTS, KPCN)),
+            ("variant", self.variant, (*VARIANTS, KPCN, UNET)),
             ("reading", self.reading, READINGS),
             ("head", self.head, ("grey", "xavier", "kernel")),
             ("detail", self.detail, ("open", "xavier")),
+            ("size", self.size or "base", ("small", "base", "large")),
+            ("guides", self.guides or "albedo-normal", ("none", "albedo", "albedo-normal")),
         ):
             if value not in known:
                 raise ValueError(f"unknown {what} {value!r}: expected one of {', '.join(known)}")

@@ -14,6 +14,8 @@ FEATURES = 12
 """Normal xyz, world position xyz, albedo RGB (first hit), albedo RGB (second hit) (Sec. 3.1)."""
 SIZE_MULTIPLE = 32
 """Heights and widths must be multiples of this: five max-pools of 2."""
+UNET_MULTIPLE = 16
+"""The same for the variant `unet`: four max-pools of 2."""
 GAMMA = 2.2
 """Exponent of the colour compression (Eq. 4)."""
 MAX_INPUT_SCALE = 1e6
@@ -24,6 +26,10 @@ FARTHEST = 5.0
 """Largest absolute position relative to the image."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 """Rec. 709 luminance of red, green and blue."""
+OIDN_LUMINANCE = np.array([0.212671, 0.715160, 0.072169], np.float32)
+"""The luminance of Open Image Denoise."""
+BIN = 16
+"""Side in pixels of the bins that Open Image Denoise measures the exposure in."""
 
 
 class Prepared(NamedTuple):
@@ -51,10 +57,21 @@ def prepare(color_hdr: np.ndarray, features: np.ndarray, meta: dict, scale: floa
     return Prepared(np.float32(color_hdr) * scale, map_positions(np.float32(features), meta), scale)
 
 
-def pad(image: np.ndarray) -> np.ndarray:
-    """Repeats the edges of [C, H, W] up to multiples of 32: right and bottom."""
+def pad(image: np.ndarray, meta: dict | None = None) -> np.ndarray:
+    """Colour or features [C, H, W], padded at the right and the bottom to the sizes that the network takes.
+
+    Edges are repeated up to multiples of 32. For the variant `unet` of `meta`, black and the features' means are
+    appended up to multiples of 16.
+    """
     height, width = image.shape[-2:]
-    return np.pad(image, ((0, 0), (0, -height % SIZE_MULTIPLE), (0, -width % SIZE_MULTIPLE)), "edge")
+    if meta is None or meta["model"]["variant"] != "unet":
+        return np.pad(image, ((0, 0), (0, -height % SIZE_MULTIPLE), (0, -width % SIZE_MULTIPLE)), "edge")
+    size = [length + -length % UNET_MULTIPLE for length in (height, width)]
+    fill = meta["normalizer"]["features"]["mean"] if len(image) == FEATURES else [0.0] * len(image)
+    padded = np.empty((len(image), *size), image.dtype)
+    padded[:] = np.array(fill)[:, None, None]
+    padded[:, :height, :width] = image
+    return padded
 
 
 def layer_color(name: str) -> int:
@@ -70,7 +87,7 @@ def input_scale(color_hdr: np.ndarray, meta: dict) -> float:
     the middle of the training scenes' exposures. A black image has the factor 1. One factor serves
     a whole sequence and all tiles of an image.
     """
-    exposure = exposure_of(color_hdr)
+    exposure = exposure_of(color_hdr, meta["normalizer"].get("transfer", "gamma"))
     if exposure == 0:
         return 1.0
     level = meta["normalizer"].get("exposure_level")
@@ -84,10 +101,28 @@ def input_scale(color_hdr: np.ndarray, meta: dict) -> float:
     return float(np.float32(np.clip(level / exposure, 1 / MAX_INPUT_SCALE, MAX_INPUT_SCALE)))
 
 
-def exposure_of(color_hdr: np.ndarray) -> float:
-    """``mean(luminance^(1/2.2))^2.2`` of linear colour [3, H, W]; 0 for a black image."""
+def exposure_of(color_hdr: np.ndarray, transfer: str = "gamma") -> float:
+    """``mean(luminance^(1/2.2))^2.2`` of linear colour [3, H, W]; 0 for a black image.
+
+    With the curve of Open Image Denoise, `transfer` "pu": the geometric mean of the luminance of bins of 16x16 pixels.
+    """
+    if transfer == "pu":
+        return exposure_of_bins(color_hdr)
     luminance = np.tensordot(LUMINANCE, np.float32(color_hdr), 1)
     return float(np.mean(np.maximum(luminance, 0).astype(np.float64) ** (1 / GAMMA)) ** GAMMA)
+
+
+def exposure_of_bins(color_hdr: np.ndarray) -> float:
+    """The exposure of [3, H, W] as Open Image Denoise measures it. Bins below 1e-8 do not count."""
+    luminance = np.tensordot(OIDN_LUMINANCE, np.maximum(np.float32(color_hdr), 0), 1).astype(np.float64)
+    rows, columns = (
+        [i * length // -(-length // BIN) for i in range(-(-length // BIN))] for length in luminance.shape
+    )
+    sums = np.add.reduceat(np.add.reduceat(luminance, rows, 0), columns, 1)
+    heights, widths = (np.diff([*starts, end]) for starts, end in zip((rows, columns), luminance.shape))
+    means = sums / np.outer(heights, widths)
+    means = means[means > 1e-8]
+    return float(2 ** np.log2(means).mean()) if means.size else 0.0
 
 
 def map_positions(features: np.ndarray, meta: dict) -> np.ndarray:

@@ -58,12 +58,12 @@ impl PyBundle {
 
     /// The feature arrays that the network needs.
     fn required(&self) -> Vec<&'static str> {
-        if !self.0.meta.model.variant.spec().takes_features() {
-            return Vec::new();
-        }
+        let model = &self.0.meta.model;
         let policies = FEATURES.into_iter().zip(self.0.missing().in_order());
-        let needed = policies.filter(|(_, missing)| *missing == Missing::Error);
-        needed.map(|(name, _)| name).collect()
+        let needed = policies.enumerate().filter(|(index, (_, missing))| {
+            *missing == Missing::Error && model.takes_feature(3 * index)
+        });
+        needed.map(|(_, (name, _))| name).collect()
     }
 
     /// Whether the network can denoise layers.
@@ -75,9 +75,11 @@ impl PyBundle {
     fn input_scale(&self, py: Python<'_>, color: &Bound<'_, PyAny>) -> PyResult<f32> {
         let color = Array::new("color", color)?;
         let measure = |_: Caller<()>| -> Result<Option<f64>, BufferError> {
-            let planes = color.view()?.to_planar()?;
+            let view = color.view()?;
+            let (height, width) = view.size();
+            let planes = view.to_planar()?;
             let is_finite = planes.iter().all(|sample| sample.is_finite());
-            Ok(is_finite.then(|| demc_data::input::ranges::exposure(&planes)))
+            Ok(is_finite.then(|| self.0.exposure(&planes, height, width)))
         };
         let exposure = work::run(py, measure, work::UNHEARD)?.map_err(exception)?;
         let exposure =

@@ -32,6 +32,7 @@ pub fn identity() -> Normalizer {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
         position: PositionSpace::Scene,
+        transfer: demc_data::Transfer::Gamma,
         exposure_level: None,
         restore_light: false,
         features,

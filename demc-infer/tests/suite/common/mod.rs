@@ -49,6 +49,7 @@ fn bundle_with(head: Head, albedo_demodulation_epsilon: Option<f32>) -> Bundle {
         gamma: 2.2,
         albedo_demodulation_epsilon,
         position: PositionSpace::Scene,
+        transfer: demc_data::Transfer::Gamma,
         exposure_level: None,
         restore_light: false,
         features: FeatureStats {

@@ -7,8 +7,8 @@ use demc_kernels::blend::Scales;
 use demc_kernels::filter::Filter;
 use demc_kernels::rel_mse::RelMse;
 use demc_kernels::{
-    Convolution, Grid, Isa, batch_norm, blend, conv1x1, conv3x3, conv5x5, deconv4x4, filter, grid,
-    pool, rel_mse,
+    Convolution, Grid, Isa, batch_norm, blend, conv1x1, conv3x3, conv5x5, deconv4x4, double,
+    filter, grid, pool, rel_mse,
 };
 
 use super::{KernelOps, buffer, contiguous, dims, grid, maps, tensor, values};
@@ -93,6 +93,14 @@ impl KernelOps for Flex {
         let mut y = buffer(grid.halved().pixels() * channels);
         pool::forward(Isa::current(), grid, values(&x), &mut y);
         maps(grid.halved(), y)
+    }
+
+    fn double_and_append(coarse: FlexTensor, skip: FlexTensor) -> FlexTensor {
+        let [coarse, skip] = [coarse, skip].map(contiguous);
+        let ((_, below), (grid, beside)) = (grid(&coarse), grid(&skip));
+        let mut y = buffer(grid.pixels() * (below + beside));
+        double::forward(grid, values(&coarse), values(&skip), &mut y);
+        maps(grid, y)
     }
 
     fn halve(x: FlexTensor) -> FlexTensor {

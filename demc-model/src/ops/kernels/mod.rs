@@ -69,6 +69,8 @@ pub(super) trait KernelOps: Backend {
     ) -> FloatTensor<Self>;
     /// 2x2, stride 2.
     fn max_pool(x: FloatTensor<Self>) -> FloatTensor<Self>;
+    /// `coarse` doubled by repeating pixels, then the channels of `skip`.
+    fn double_and_append(coarse: FloatTensor<Self>, skip: FloatTensor<Self>) -> FloatTensor<Self>;
     /// The mean of each 2x2 window; not differentiable.
     fn halve(x: FloatTensor<Self>) -> FloatTensor<Self>;
     /// An image and 25, 26, or 441 logits per pixel; the image has no gradient.
@@ -173,6 +175,13 @@ pub(super) fn fuse(
 
 pub(super) fn max_pool(x: Tensor<4>) -> Tensor<4> {
     Tensor::from_dispatch(Dispatch::max_pool(x.into_dispatch()))
+}
+
+pub(super) fn double_and_append(coarse: Tensor<4>, skip: Tensor<4>) -> Tensor<4> {
+    Tensor::from_dispatch(Dispatch::double_and_append(
+        coarse.into_dispatch(),
+        skip.into_dispatch(),
+    ))
 }
 
 pub(super) fn halve(x: Tensor<4>) -> Tensor<4> {

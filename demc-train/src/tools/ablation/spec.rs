@@ -13,7 +13,7 @@
 
 use std::path::{Path, PathBuf};
 
-use demc_model::{ModelConfig, Variant};
+use demc_model::ModelConfig;
 use demc_program::file::{MAX_CONFIGURATION, read_text};
 use serde::Deserialize;
 
@@ -246,12 +246,14 @@ impl AblationFile {
 }
 
 /// Gives every other variant with encoders the width with the parameter count closest to the first
-/// one's. KPCN keeps its own: the paper compares networks of different sizes.
+/// one's. Others keep their own: the paper compares networks of different sizes.
 fn match_parameters(variants: &mut [AblationVariant]) {
     if let Some((first, others)) = variants.split_first_mut() {
         let parameters = first.config.model.parameter_count();
-        let with_encoders =
-            |variant: &&mut AblationVariant| variant.config.model.variant != Variant::Kpcn;
+        let with_encoders = |variant: &&mut AblationVariant| {
+            let spec = variant.config.model.variant.spec();
+            !spec.encoders.is_empty()
+        };
         for variant in others.iter_mut().filter(with_encoders) {
             let model = variant.config.model;
             variant.config.model = ModelConfig {

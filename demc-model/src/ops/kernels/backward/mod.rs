@@ -16,7 +16,7 @@ use burn::backend::{Autodiff, AutodiffBackend, Flex};
 use demc_kernels::batch_norm::{BatchNormSource, Moments};
 use demc_kernels::blend::Scales;
 use demc_kernels::filter::Filter;
-use demc_kernels::{Isa, batch_norm, blend, filter, pool};
+use demc_kernels::{Isa, batch_norm, blend, double, filter, pool};
 
 use super::forward::{fuse, rel_mse_into};
 use super::{KernelOps, buffer, contiguous, dims, grid, maps, tensor, values};
@@ -72,6 +72,13 @@ impl<C: CheckpointStrategy> KernelOps for Autodiff<Flex, C> {
     fn max_pool(x: Tracked) -> Tracked {
         let ([x], nodes) = parts([x]);
         record::<_, C, _>(MaxPool, nodes, Flex::max_pool(x.clone()), |_| x)
+    }
+
+    fn double_and_append(coarse: Tracked, skip: Tracked) -> Tracked {
+        let ([coarse, skip], nodes) = parts([coarse, skip]);
+        let channels = [&coarse, &skip].map(|maps| grid(maps).1);
+        let y = Flex::double_and_append(coarse, skip);
+        record::<_, C, _>(DoubleAndAppend, nodes, y, |_| channels)
     }
 
     fn halve(x: Tracked) -> Tracked {
@@ -256,6 +263,28 @@ impl Backward<Flex, 2> for Blend {
         let scales = Scales { filtered, coarse };
         blend::backward(grid, scales, values(&dout), dfiltered, dcoarse);
         let grids = [grid, grid.halved()];
+        for ((node, gradient), grid) in ops.parents.into_iter().zip(gradients).zip(grids) {
+            if let Some(node) = node {
+                grads.register::<Flex>(node.id, maps(grid, gradient));
+            }
+        }
+    }
+}
+
+#[derive(Debug)]
+struct DoubleAndAppend;
+
+impl Backward<Flex, 2> for DoubleAndAppend {
+    /// Channels of both inputs.
+    type State = [usize; 2];
+
+    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let dy = contiguous(grads.consume::<Flex>(&ops.node));
+        let (fine, _) = grid(&dy);
+        let grids = [fine.halved(), fine];
+        let mut gradients = [0, 1].map(|part| buffer(grids[part].pixels() * ops.state[part]));
+        let [dcoarse, dskip] = &mut gradients;
+        double::backward(fine, values(&dy), dcoarse, dskip);
         for ((node, gradient), grid) in ops.parents.into_iter().zip(gradients).zip(grids) {
             if let Some(node) = node {
                 grads.register::<Flex>(node.id, maps(grid, gradient));

@@ -1,0 +1,261 @@
+//! The forward pass of a U-Net, level by level, large maps in bands of rows.
+//!
+//! No map of the full resolution is whole but those of the input and the output: a band of the encoder's
+//! first level is pooled, and a band of the decoder's last level is made from the map below and the input.
+
+use std::ops::Range;
+
+use burn::backend::Flex;
+use burn::backend::flex::FlexTensor;
+use burn::tensor::{Tensor, TensorData};
+use demc_kernels::conv3x3::{PreparedConvolution, Tile};
+use demc_kernels::{Grid, Isa, double, memory, pool};
+use rayon::prelude::*;
+
+use super::band::{BandedConv, ConvChain, RowWindow, bands};
+use super::feature_maps::FeatureMaps;
+use super::folded::FoldedConv;
+use super::full_resolution::write_rows;
+use super::images::host;
+use super::pass::BandPlan;
+use super::watch::{Cancelled, Observer, Watch};
+use crate::config::{COLOR_CHANNELS, FEATURE_CHANNELS};
+use crate::unet::{UNET_LEVELS, Unet, UnetLevel};
+
+/// As [`Unet::forward`], on the host without autodiff.
+pub(crate) fn forward(
+    network: &Unet,
+    color: Tensor<4>,
+    features: Tensor<4>,
+    observer: &mut Observer,
+) -> Result<Tensor<4>, Cancelled> {
+    let [batch, _, height, width] = color.dims();
+    let input = Input::new(network, color, features);
+    let pass = UnetPass {
+        plan: BandPlan::new(width),
+        tile: Tile::F4,
+        watch: &Watch::new(input.grid, observer),
+    };
+    let planes = pass.forward(network, &input)?;
+    let shape = [batch, COLOR_CHANNELS, height, width];
+    let data = TensorData::new(planes, shape);
+    Ok(Tensor::from_primitive::<Flex>(FlexTensor::from_data(data)))
+}
+
+/// The planes of colour and guides.
+struct Input {
+    grid: Grid,
+    color: FlexTensor,
+    features: Option<FlexTensor>,
+    /// The first feature channel of each guide.
+    guides: &'static [usize],
+}
+
+impl Input {
+    fn new(network: &Unet, color: Tensor<4>, features: Tensor<4>) -> Self {
+        let [batch, _, height, width] = color.dims();
+        let guides = network.guides().first_channels();
+        Input {
+            grid: Grid {
+                batch,
+                height,
+                width,
+            },
+            color: host(color),
+            features: (!guides.is_empty()).then(|| host(features)),
+            guides,
+        }
+    }
+
+    fn channels(&self) -> usize {
+        COLOR_CHANNELS * (1 + self.guides.len())
+    }
+
+    /// Rows of an image, channels last.
+    fn interleave(&self, image: usize, rows: Range<usize>, target: &mut [f32]) {
+        let Grid { height, width, .. } = self.grid;
+        let pixels = height * width;
+        let colors = self.color.storage::<f32>().chunks_exact(pixels);
+        let mut planes: Vec<&[f32]> = colors
+            .skip(image * COLOR_CHANNELS)
+            .take(COLOR_CHANNELS)
+            .collect();
+        for first in self.guides {
+            let features = self.features.as_ref().expect("guides are features");
+            let all = features.storage::<f32>().chunks_exact(pixels);
+            planes.extend(
+                all.skip(image * FEATURE_CHANNELS + first)
+                    .take(COLOR_CHANNELS),
+            );
+        }
+        let lines = target.par_chunks_mut(width * planes.len()).enumerate();
+        lines.for_each(|(line, target)| {
+            let line = (rows.start + line) * width;
+            for (channel, plane) in planes.iter().enumerate() {
+                let pixels = target.chunks_exact_mut(planes.len());
+                for (pixel, value) in pixels.zip(&plane[line..line + width]) {
+                    pixel[channel] = *value;
+                }
+            }
+        });
+    }
+}
+
+struct UnetPass<'a> {
+    plan: BandPlan,
+    tile: Tile,
+    watch: &'a Watch<'a, 'a>,
+}
+
+impl UnetPass<'_> {
+    /// Returns the planes of the images.
+    fn forward(&self, network: &Unet, input: &Input) -> Result<Vec<f32>, Cancelled> {
+        let grid = input.grid;
+        // The input of each encoder level but the first, which is the skip of the decoder's.
+        let mut skips: Vec<FeatureMaps> = Vec::with_capacity(UNET_LEVELS);
+        for (level, module) in network.encoder.iter().enumerate() {
+            let grid = (0..level).fold(grid, |grid, _| grid.halved());
+            let convs = folded(module);
+            let outputs = convs.last().expect("a convolution").outputs();
+            let mut below = FeatureMaps::new(grid.halved(), outputs);
+            self.run(
+                &convs,
+                grid,
+                |image, rows, target| match skips.last() {
+                    None => input.interleave(image, rows, target),
+                    Some(maps) => target.copy_from_slice(maps.rows(image, rows)),
+                },
+                |image, rows, values| {
+                    let band = Grid {
+                        batch: 1,
+                        height: rows.len(),
+                        ..grid
+                    };
+                    let target = below.rows_mut(image, rows.start / 2..rows.end / 2);
+                    pool::forward(Isa::current(), band, values, target);
+                },
+            )?;
+            skips.push(below);
+        }
+        let deepest = skips.pop().expect("four levels");
+        let mut x = self.level(
+            &folded(&network.bottom),
+            deepest.grid,
+            |image, rows, target| {
+                target.copy_from_slice(deepest.rows(image, rows));
+            },
+        )?;
+        drop(deepest);
+        let (last, upper) = network.decoder.split_last().expect("four levels");
+        for module in upper {
+            let skip = skips.pop().expect("a skip for each level but the last");
+            let below = x;
+            x = self.level(&folded(module), skip.grid, |image, rows, target| {
+                append(
+                    &below,
+                    image,
+                    rows.clone(),
+                    skip.grid,
+                    skip.rows(image, rows),
+                    target,
+                );
+            })?;
+        }
+        let mut convs = folded(last);
+        convs.push(FoldedConv::conv(&network.head, None));
+        let mut planar = memory::buffer(grid.pixels() * COLOR_CHANNELS);
+        let image_values = grid.height * grid.width * COLOR_CHANNELS;
+        self.run(
+            &convs,
+            grid,
+            |image, rows, target| {
+                let mut skip = memory::buffer(rows.len() * grid.width * input.channels());
+                input.interleave(image, rows.clone(), &mut skip);
+                append(&x, image, rows, grid, &skip, target);
+            },
+            |image, rows, values| {
+                let planar = &mut planar[image * image_values..][..image_values];
+                write_rows(planar, grid, rows, values);
+            },
+        )?;
+        Ok(planar)
+    }
+
+    /// A level's whole output.
+    fn level(
+        &self,
+        convs: &[FoldedConv],
+        grid: Grid,
+        fill: impl FnMut(usize, Range<usize>, &mut [f32]),
+    ) -> Result<FeatureMaps, Cancelled> {
+        let outputs = convs.last().expect("a convolution").outputs();
+        let mut maps = FeatureMaps::new(grid, outputs);
+        self.run(convs, grid, fill, |image, rows, values| {
+            maps.rows_mut(image, rows).copy_from_slice(values);
+        })?;
+        Ok(maps)
+    }
+
+    /// Runs convolutions with ReLU on bands of maps on `grid`: `fill` writes rows of an image's input,
+    /// `take` gets rows of its output.
+    fn run(
+        &self,
+        convs: &[FoldedConv],
+        grid: Grid,
+        mut fill: impl FnMut(usize, Range<usize>, &mut [f32]),
+        mut take: impl FnMut(usize, Range<usize>, &[f32]),
+    ) -> Result<(), Cancelled> {
+        let banded = convs.iter().map(|conv| {
+            let prepared = PreparedConvolution::new(Isa::current(), self.tile, conv.rectified());
+            BandedConv::new(prepared, grid)
+        });
+        let outputs = convs.last().expect("a convolution").outputs();
+        let mut chain = ConvChain {
+            convs: banded.collect(),
+            output: RowWindow::new(grid, outputs),
+        };
+        let band = if self.plan.is_banded(grid) {
+            self.plan.band
+        } else {
+            grid.height
+        };
+        for image in 0..grid.batch {
+            chain.restart();
+            for rows in bands(grid.height, band) {
+                self.watch.add(rows.len() * grid.width)?;
+                let target = chain.input().push(rows.len());
+                fill(image, rows, target);
+                chain.advance(|_, _, _| ());
+                let range = chain.output.range();
+                if !range.is_empty() {
+                    take(image, range, chain.output.all().1);
+                    chain.output.free_all();
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Rows of an image's input of a decoder level: the map below doubled, then `skip`, which has these rows.
+fn append(
+    below: &FeatureMaps,
+    image: usize,
+    rows: Range<usize>,
+    grid: Grid,
+    skip: &[f32],
+    target: &mut [f32],
+) {
+    let band = Grid {
+        batch: 1,
+        height: rows.len(),
+        ..grid
+    };
+    let coarse = below.rows(image, rows.start / 2..rows.end / 2);
+    double::forward(band, coarse, skip, target);
+}
+
+fn folded(level: &UnetLevel) -> Vec<FoldedConv> {
+    let convs = level.convs.iter();
+    convs.map(|conv| FoldedConv::conv(conv, None)).collect()
+}
