@@ -37,7 +37,7 @@ const NO_FILTER: &str = "none";
   demc-infer export --model runs/demc -o demc.safetensors
   demc-infer export --model runs/demc --names torch --precision f16 -o demc-torch.safetensors
   demc-infer export --model runs/demc --verify -o demc.onnx
-  demc-infer export --model runs/unet --precision f16 -o unet.tza
+  demc-infer export --model runs/unet -o unet.tza
   demc-infer export --model runs/demc --albedo-filter runs/albedo -o demc-filtered.safetensors")]
 pub struct Arguments {
     #[command(flatten)]
@@ -49,10 +49,10 @@ pub struct Arguments {
     /// expects
     #[arg(long, value_enum, default_value = "burn")]
     names: NamesFlag,
-    /// Type of the stored weights. Batch normalisation stays f32, and ONNX graphs always compute in
-    /// f32
-    #[arg(long, value_enum, default_value = "f32")]
-    precision: PrecisionFlag,
+    /// Type of the stored weights [default: f16 for tza, otherwise f32]. Batch normalisation stays f32,
+    /// and ONNX graphs always compute in f32. Blender takes only f16 in a TZA file
+    #[arg(long, value_enum)]
+    precision: Option<PrecisionFlag>,
     /// Channel layout to store instead of that of the training data: demc-exr, mitsuba3, pbrt-v4,
     /// cycles, fbksd, luxcore, or a TOML file
     #[arg(long, value_name = "PRESET|FILE")]
@@ -66,8 +66,8 @@ pub struct Arguments {
     output: PathBuf,
     #[command(flatten)]
     overwrite: OverwriteFlag,
-    /// Run the file on synthetic images in ONNX Runtime, PyTorch, or Open Image Denoise and compare. Deviations above
-    /// 1e-4, or 1e-3 of a value of a kernel head, fail
+    /// Run the file on synthetic images in ONNX Runtime, PyTorch, or Open Image Denoise, and compare.
+    /// Deviations above 1e-4, or 1e-3 of a value of a kernel head, fail
     #[arg(long)]
     verify: bool,
     /// Python interpreter for --verify [default: the variable DEMC_PYTHON, or python3]
@@ -126,9 +126,9 @@ impl Arguments {
         if format != Format::Safetensors && names == Names::Torch {
             return Err(UsageError("--names is for safetensors only".into()).into());
         }
-        let precision = match self.precision {
-            PrecisionFlag::F32 => Precision::F32,
-            PrecisionFlag::F16 => Precision::F16,
+        let precision = match (self.precision, format) {
+            (Some(PrecisionFlag::F16), _) | (None, Format::Tza) => Precision::F16,
+            _ => Precision::F32,
         };
         let mut bundle = file.into_bundle(&Device::flex())?;
         match filter {
