@@ -50,7 +50,7 @@ pub struct Arguments {
     #[arg(long, value_enum, default_value = "burn")]
     names: NamesFlag,
     /// Type of the stored weights [default: f16 for tza, otherwise f32]. Batch normalisation stays f32,
-    /// and ONNX graphs always compute in f32. Blender takes only f16 in a TZA file
+    /// and ONNX graphs always compute in f32. A TZA file has f16 only
     #[arg(long, value_enum)]
     precision: Option<PrecisionFlag>,
     /// Channel layout to store instead of that of the training data: demc-exr, mitsuba3, pbrt-v4,
@@ -127,8 +127,12 @@ impl Arguments {
             return Err(UsageError("--names is for safetensors only".into()).into());
         }
         let precision = match (self.precision, format) {
+            (Some(PrecisionFlag::F32), Format::Tza) => {
+                let why = "Open Image Denoise takes only f16 in a TZA file; remove --precision";
+                return Err(UsageError(why.into()).into());
+            }
             (Some(PrecisionFlag::F16), _) | (None, Format::Tza) => Precision::F16,
-            _ => Precision::F32,
+            (Some(PrecisionFlag::F32) | None, _) => Precision::F32,
         };
         let mut bundle = file.into_bundle(&Device::flex())?;
         match filter {
@@ -156,7 +160,7 @@ impl Arguments {
                 message::status(format_args!("{output}: ONNX graph, read back and compared"));
             }
             Format::Tza => {
-                bundle.export_tza(&self.output, precision)?;
+                bundle.export_tza(&self.output)?;
                 message::status(format_args!(
                     "{output}: weights for Open Image Denoise, read back and compared"
                 ));

@@ -95,7 +95,9 @@ pub enum OidnError {
     )]
     NotHdr { name: String },
     /// A network that OIDN does not have.
-    #[error("{model}: Open Image Denoise has only networks of variant unet")]
+    #[error(
+        "{model}: Open Image Denoise has only networks of variant unet with data.transfer = \"pu\""
+    )]
     NotUnet { model: String },
     /// A network with an albedo filter.
     #[error("Open Image Denoise has no albedo filter; remove it with --albedo-filter none")]
@@ -247,14 +249,15 @@ impl Bundle {
         Ok(Bundle::new(meta.with_license(LICENSE), network))
     }
 
-    /// Writes the network as a TZA file of Open Image Denoise atomically, reads it back, and compares.
+    /// Writes the network as a TZA file of Open Image Denoise atomically, reads it back, and compares. The
+    /// weights are half precision: OIDN 2.5 refuses others.
     ///
     /// # Errors
     /// [`OidnError::NotUnet`], [`OidnError::AlbedoFilter`]; a weight beyond f16's range; a path that cannot
     /// be written; a file that differs from what was written.
-    pub fn export_tza(&self, path: &Path, precision: Precision) -> Result<(), OidnError> {
-        let rounded = self.rounded(precision)?;
-        let bytes = rounded.to_tza(precision)?;
+    pub fn export_tza(&self, path: &Path) -> Result<(), OidnError> {
+        let rounded = self.rounded(Precision::F16)?;
+        let bytes = rounded.to_tza()?;
         demc_program::file::write_whole(path, |file| file.write_all(&bytes))
             .map_err(BundleError::from)?;
         let back = Bundle::import_oidn(path, None, &self.device())?;
@@ -272,7 +275,7 @@ impl Bundle {
     ///
     /// # Errors
     /// [`OidnError::NotUnet`], [`OidnError::AlbedoFilter`].
-    fn to_tza(&self, precision: Precision) -> Result<Vec<u8>, OidnError> {
+    fn to_tza(&self) -> Result<Vec<u8>, OidnError> {
         let model = &self.meta.model;
         if model.variant != Variant::Unet || self.meta.normalizer.transfer != Transfer::Pu {
             let model = model.to_string();
@@ -282,7 +285,7 @@ impl Bundle {
             return Err(OidnError::AlbedoFilter);
         }
         let tensors = network::renamed(self.model.weights(), model.unet_size());
-        Ok(format::write(&tensors, precision))
+        Ok(format::write(&tensors, Precision::F16))
     }
 }
 
@@ -301,5 +304,48 @@ fn normalizer() -> Normalizer {
         restore_light: false,
         features: features.with_ranges_of(Transfer::Pu),
         flat_color: [0.0; 3],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bundle::testing::{bundle, filtered};
+
+    fn unet() -> Bundle {
+        let mut unet = bundle(Variant::Unet);
+        unet.meta.normalizer = normalizer();
+        unet
+    }
+
+    #[test]
+    fn an_export_comes_back_as_a_model() {
+        let folder = tempfile::TempDir::new().expect("a temporary directory");
+        let path = folder.path().join("unet.tza");
+        let model = unet();
+        model.export_tza(&path).expect("exported");
+        let back = Bundle::import_oidn(&path, None, &model.device()).expect("its own");
+        let rounded = model.rounded(Precision::F16).expect("small weights");
+        assert_eq!(back.model.weights(), rounded.model.weights());
+        assert_eq!(back.meta.model.unet_size(), model.meta.model.unet_size());
+        assert_eq!(back.meta.model.guides(), model.meta.model.guides());
+        assert_eq!(back.meta.normalizer, model.meta.normalizer);
+        let unknown = Bundle::import_oidn(&path, Some("1"), &model.device());
+        let message = unknown.expect_err("one set").to_string();
+        assert!(message.ends_with("no weights `1`; it has 0"), "{message}");
+    }
+
+    #[test]
+    fn other_networks_are_refused() {
+        let folder = tempfile::TempDir::new().expect("a temporary directory");
+        let path = folder.path().join("x.tza");
+        let error = |bundle: &Bundle| bundle.export_tza(&path).expect_err("refused");
+        let other = error(&bundle(Variant::Semc));
+        assert!(matches!(other, OidnError::NotUnet { .. }), "{other}");
+        let gamma = error(&bundle(Variant::Unet));
+        assert!(matches!(gamma, OidnError::NotUnet { .. }), "{gamma}");
+        let mut filter = filtered(Variant::Unet, Variant::Demc);
+        filter.meta.normalizer = normalizer();
+        assert!(matches!(error(&filter), OidnError::AlbedoFilter));
     }
 }

@@ -78,6 +78,20 @@ fn flags_that_do_not_go_together_are_usage_errors() {
 }
 
 #[test]
+fn a_tza_file_takes_unets_in_half_precision() {
+    let run = run_directory();
+    let file = run.path().join("x.tza");
+    let export = |flags: &[&str]| export(run.path(), &file, flags);
+    export(&["--precision", "f32"]).failure(2, "Open Image Denoise takes only f16");
+    let stderr = export(&[]).failure(1, "").stderr;
+    assert!(
+        stderr.contains("has only networks of variant unet"),
+        "{stderr}"
+    );
+    assert!(!file.exists());
+}
+
+#[test]
 fn an_onnx_export_is_half_as_large_in_f16() {
     let run = run_directory();
     let size = |precision: &str| {
