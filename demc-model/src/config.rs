@@ -308,12 +308,12 @@ pub struct ModelConfig {
     pub head: Head,
     /// Initialisation of the detail map.
     pub detail: Detail,
-    /// Size of a U-Net; `None` means base.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub size: Option<UnetSize>,
-    /// Guides of a U-Net; `None` means albedo and normal.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub guides: Option<Guides>,
+    /// Size of a U-Net. Absent in files if it is the default, as the guides are: other variants have none.
+    #[serde(skip_serializing_if = "UnetSize::is_default")]
+    pub size: UnetSize,
+    /// Guides of a U-Net.
+    #[serde(skip_serializing_if = "Guides::is_default")]
+    pub guides: Guides,
 }
 
 impl Default for ModelConfig {
@@ -326,8 +326,8 @@ impl Default for ModelConfig {
             levels: LEVEL_WIDTHS,
             head: Head::Grey,
             detail: Detail::Open,
-            size: None,
-            guides: None,
+            size: UnetSize::default(),
+            guides: Guides::default(),
         }
     }
 }
@@ -340,7 +340,7 @@ impl fmt::Display for ModelConfig {
         match self.variant {
             Variant::Kpcn => return write!(f, "{variant}, width {}", self.width),
             Variant::Unet => {
-                let [size, guides] = [self.unet_size().spec().name, self.guides().name()];
+                let [size, guides] = [self.size.spec().name, self.guides.name()];
                 return write!(f, "{variant}, {size}, guides {guides}");
             }
             _ => (),
@@ -354,21 +354,11 @@ impl fmt::Display for ModelConfig {
 }
 
 impl ModelConfig {
-    /// Size of a U-Net.
-    pub fn unet_size(&self) -> UnetSize {
-        self.size.unwrap_or_default()
-    }
-
-    /// Guides of a U-Net.
-    pub fn guides(&self) -> Guides {
-        self.guides.unwrap_or_default()
-    }
-
     /// Whether one of the 12 feature channels has any effect.
     pub fn takes_feature(&self, channel: usize) -> bool {
         match self.variant {
             Variant::Unet => {
-                let firsts = self.guides().first_channels().iter();
+                let firsts = self.guides.first_channels().iter();
                 firsts
                     .into_iter()
                     .any(|first| (*first..first + 3).contains(&channel))
@@ -420,8 +410,8 @@ impl ModelConfig {
                 ..ModelConfig::default()
             },
             _ => ModelConfig {
-                size: None,
-                guides: None,
+                size: UnetSize::default(),
+                guides: Guides::default(),
                 ..*self
             },
         };

@@ -152,8 +152,8 @@ mod tests {
         ] {
             let unet = ModelConfig {
                 variant: Variant::Unet,
-                size: Some(size),
-                guides: Some(guides),
+                size,
+                guides,
                 ..ModelConfig::default()
             };
             assert_eq!(unet.parameter_count(), parameters);
@@ -166,8 +166,8 @@ mod tests {
         for (size, guides) in UnetSize::ALL.into_iter().zip(Guides::ALL) {
             check(ModelConfig {
                 variant: Variant::Unet,
-                size: Some(size),
-                guides: Some(guides),
+                size,
+                guides,
                 ..ModelConfig::default()
             });
         }

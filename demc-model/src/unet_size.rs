@@ -57,6 +57,10 @@ impl UnetSize {
     /// All sizes, smallest first.
     pub const ALL: [UnetSize; 3] = [UnetSize::Small, UnetSize::Base, UnetSize::Large];
 
+    pub(crate) fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
     /// The table of sizes.
     pub fn spec(self) -> &'static UnetSpec {
         match self {
@@ -85,6 +89,10 @@ impl UnetSize {
 impl Guides {
     /// From none to both.
     pub const ALL: [Guides; 3] = [Guides::None, Guides::Albedo, Guides::AlbedoNormal];
+
+    pub(crate) fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
 
     /// The name in configurations.
     pub fn name(self) -> &'static str {

@@ -5,8 +5,8 @@
 Each view becomes one file of the layout `demc-exr`: colour and features of 4 samples per pixel, and a reference with
 other samples, whose own albedo and normal are kept for `tools/references.py`. The second albedo is a copy of the
 first. Existing files are kept, so an interrupted command can be repeated. `docs/renderers.md` reports scenes 1 to 4; this
-script refuses them. `--with` also lists the training scenes of another data set. `--copies` lists each view several times,
-so that a few views count more.
+script refuses them. `--split test` lists views that training does not see. `--with` also lists the training scenes of
+another data set. `--copies` lists each view several times, so that a few views count more.
 """
 
 from __future__ import annotations
@@ -92,6 +92,7 @@ def main() -> None:
     parser.add_argument("--size", default="224x224")
     parser.add_argument("--spp", type=int, default=4)
     parser.add_argument("--ref-spp", type=int, default=128)
+    parser.add_argument("--split", choices=["train", "test"], default="train")
     parser.add_argument("--copies", type=int, default=1)
     parser.add_argument("--with", dest="other", type=Path, metavar="DIR")
     options = parser.parse_args()
@@ -99,7 +100,7 @@ def main() -> None:
     numbers = range(int(first), int(last or first) + 1)
     if any(number in REPORTED for number in numbers):
         parser.error(f"scenes {REPORTED[0]} to {REPORTED[-1]} are for tests only")
-    (options.output / "train").mkdir(parents=True, exist_ok=True)
+    (options.output / options.split).mkdir(parents=True, exist_ok=True)
     manifest = options.output / "manifest.json"
     listed = json.loads(manifest.read_text()) if manifest.exists() else {"format": "demc-exr 1", "scenes": []}
     known = {scene["name"] for scene in listed["scenes"]}
@@ -113,8 +114,8 @@ def main() -> None:
         name = f"{options.renderer}-{number}"
         if name in known:
             continue
-        write(options.output / "train" / f"{name}.exr", view(options.renderer, number, options))
-        about = {"name": name, "split": "train", "base": f"stock-{number}", "file": f"train/{name}.exr", "width": width, "height": height}
+        write(options.output / options.split / f"{name}.exr", view(options.renderer, number, options))
+        about = {"name": name, "split": options.split, "base": f"stock-{number}", "file": f"{options.split}/{name}.exr", "width": width, "height": height}
         about |= {"spp": options.spp, "ref_spp": options.ref_spp, "renderer": options.renderer}
         listed["scenes"] += [about] + [about | {"name": f"{name}-copy-{copy}"} for copy in range(2, options.copies + 1)]
         manifest.write_text(json.dumps(listed, indent=1))

@@ -37,7 +37,7 @@ fn bundle_with(variant: Variant, head: Head) -> Bundle {
     let model = match variant {
         Variant::Unet => ModelConfig {
             variant,
-            size: Some(UnetSize::Small),
+            size: UnetSize::Small,
             ..ModelConfig::default()
         },
         _ => ModelConfig {

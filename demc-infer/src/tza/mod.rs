@@ -58,8 +58,8 @@ impl WeightSet {
     pub fn model(&self) -> ModelConfig {
         ModelConfig {
             variant: Variant::Unet,
-            size: Some(self.size),
-            guides: Some(self.guides),
+            size: self.size,
+            guides: self.guides,
             ..ModelConfig::default()
         }
     }
@@ -284,7 +284,7 @@ impl Bundle {
         if self.albedo_filter.is_some() {
             return Err(OidnError::AlbedoFilter);
         }
-        let tensors = network::renamed(self.model.weights(), model.unet_size());
+        let tensors = network::renamed(self.model.weights(), model.size);
         Ok(format::write(&tensors, Precision::F16))
     }
 }
@@ -327,8 +327,7 @@ mod tests {
         let back = Bundle::import_oidn(&path, None, &model.device()).expect("its own");
         let rounded = model.rounded(Precision::F16).expect("small weights");
         assert_eq!(back.model.weights(), rounded.model.weights());
-        assert_eq!(back.meta.model.unet_size(), model.meta.model.unet_size());
-        assert_eq!(back.meta.model.guides(), model.meta.model.guides());
+        assert_eq!(back.meta.model, model.meta.model);
         assert_eq!(back.meta.normalizer, model.meta.normalizer);
         let unknown = Bundle::import_oidn(&path, Some("1"), &model.device());
         let message = unknown.expect_err("one set").to_string();

@@ -52,8 +52,8 @@ pub(super) fn renamed(weights: Vec<Weight>, size: UnetSize) -> Vec<Weight> {
 fn specs(size: UnetSize, guides: Guides) -> Vec<(String, String, Vec<usize>)> {
     let model = ModelConfig {
         variant: Variant::Unet,
-        size: Some(size),
-        guides: Some(guides),
+        size,
+        guides,
         ..ModelConfig::default()
     };
     let specs = model.weight_specs().into_iter();

@@ -189,7 +189,7 @@ pub fn verify(
         outputs.push(batch.output);
     }
     let head = expected.meta.model.head;
-    let guides = expected.meta.model.guides();
+    let guides = expected.meta.model.guides;
     let runtime = run(file, runtime, guides, python, folder.path())?;
     let mut deviations = Vec::with_capacity(sizes.len());
     for ((i, size), expected) in sizes.into_iter().enumerate().zip(outputs) {

@@ -60,8 +60,8 @@ fn keys_of_encoders_are_a_problem_of_kpcn() {
 fn keys_of_other_variants_are_a_problem_of_a_unet_and_its_own_of_others() {
     let unet = ModelConfig {
         variant: Variant::Unet,
-        size: Some(UnetSize::Large),
-        guides: Some(Guides::Albedo),
+        size: UnetSize::Large,
+        guides: Guides::Albedo,
         ..ModelConfig::default()
     };
     assert_eq!(unet.validate(), Vec::<String>::new());

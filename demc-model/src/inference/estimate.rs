@@ -38,8 +38,8 @@ pub fn pass_bytes(
         Variant::Kpcn => return kpcn_bytes(config, height * width),
         Variant::Unet if ops.has_fast_inference() => return unet_bytes(config, height, width),
         Variant::Unet => {
-            let [.., [_, below], _] = config.unet_size().spec().decoder;
-            let channels = below + config.guides().channels();
+            let [.., [_, below], _] = config.size.spec().decoder;
+            let channels = below + config.guides.channels();
             return BURN_VALUES * (channels * height * width * VALUE) as u64;
         }
         _ => (),

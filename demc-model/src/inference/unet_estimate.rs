@@ -10,8 +10,8 @@ use crate::unet::{UNET_LEVELS, UnetSpec};
 /// the map that it writes, a band of its convolutions, and their prepared weights.
 pub(super) fn unet_bytes(config: &ModelConfig, height: usize, width: usize) -> u64 {
     let estimate = UnetEstimate {
-        spec: config.unet_size().spec(),
-        inputs: config.guides().channels(),
+        spec: config.size.spec(),
+        inputs: config.guides.channels(),
         plan: BandPlan::new(width),
         height,
         width,

@@ -9,8 +9,8 @@ use rand_chacha::ChaCha8Rng;
 fn network(size: UnetSize, guides: Guides) -> Denoiser {
     let config = ModelConfig {
         variant: Variant::Unet,
-        size: Some(size),
-        guides: Some(guides),
+        size,
+        guides,
         ..ModelConfig::default()
     };
     let mut rng = ChaCha8Rng::seed_from_u64(3);

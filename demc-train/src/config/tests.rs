@@ -133,6 +133,20 @@ fn a_set_without_value_restores_the_default() {
     assert!(parsed("", &["run.dir="]).is_ok(), "absent already");
 }
 
+/// So `train.init` may name weights whose file does not list them.
+#[test]
+fn keys_of_a_unet_may_have_their_defaults() {
+    let variant = "[model]\nvariant = \"unet\"\n";
+    let plain = parsed(variant, &[]).unwrap();
+    let listed = format!("{variant}size = \"base\"\nguides = \"albedo-normal\"\n");
+    assert_eq!(parsed(&listed, &[]).unwrap(), plain);
+    let other = parsed(variant, &["model.size=small"]).unwrap();
+    assert_eq!(
+        other.differences(&plain),
+        ["model.size: \"small\" instead of absent"]
+    );
+}
+
 #[test]
 fn bad_sets_are_named() {
     let error = |set| parsed("", &[set]).unwrap_err();

@@ -173,7 +173,7 @@ pub fn random_unet(rng: &mut ChaCha8Rng) -> Bundle {
     let random = random_bundle(Variant::DemcNosn, Reading::Released, 0.0..0.1, rng);
     let model = ModelConfig {
         variant: Variant::Unet,
-        size: Some(UnetSize::Small),
+        size: UnetSize::Small,
         ..ModelConfig::default()
     };
     let network = model.init(rng, [0.0; 3], &Device::flex());

@@ -94,8 +94,8 @@ class ModelConfig:
     levels: tuple[int, ...] = LEVEL_FACTORS
     head: str = "grey"
     detail: str = "open"
-    size: str | None = None  # of a U-Net: small, base, or large
-    guides: str | None = None  # of a U-Net: none, albedo, or albedo-normal
+    size: str = "base"  # of a U-Net: small, base, or large
+    guides: str = "albedo-normal"  # of a U-Net: none, albedo, or albedo-normal
 
     def __post_init__(self) -> None:
         for what, value, known in (
@@ -103,8 +103,8 @@ class ModelConfig:
             ("reading", self.reading, READINGS),
             ("head", self.head, ("grey", "xavier", "kernel")),
             ("detail", self.detail, ("open", "xavier")),
-            ("size", self.size or "base", ("small", "base", "large")),
-            ("guides", self.guides or "albedo-normal", ("none", "albedo", "albedo-normal")),
+            ("size", self.size, ("small", "base", "large")),
+            ("guides", self.guides, ("none", "albedo", "albedo-normal")),
         ):
             if value not in known:
                 raise ValueError(f"unknown {what} {value!r}: expected one of {', '.join(known)}")

@@ -39,8 +39,8 @@ class Unet(nn.Module):
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         self.config = config
-        encoder, bottom, decoder = SIZES[config.size or "base"]
-        self.guides = GUIDES[config.guides or "albedo-normal"]
+        encoder, bottom, decoder = SIZES[config.size]
+        self.guides = GUIDES[config.guides]
         channels = 3 * (1 + len(self.guides))
         skips = [channels]
         self.encoder = nn.ModuleList()
