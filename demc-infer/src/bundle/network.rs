@@ -1,8 +1,11 @@
 //! A network ready to denoise, and its albedo filter. The filter is a second network in the same file;
 //! it denoises the first hit's albedo before the main network sees it ([`crate::denoise`]).
 
+use std::iter;
+
 use demc_data::image::layout::{Missing, MissingPolicies};
 use demc_model::Denoiser;
+use demc_model::config::COLOR_CHANNELS;
 
 use super::error::BundleError;
 use super::meta::BundleMeta;
@@ -39,14 +42,37 @@ impl Bundle {
     }
 
     /// The feature buffers that a file may lack, and what replaces them. The policies are those of
-    /// the training's layout. Without one, texture1 replaces texture2 and zeros the position.
-    /// With the bundled models these two changed the error by less than 3 %.
+    /// the training's layout. Without one, zeros replace what no network takes; texture1 replaces texture2
+    /// and zeros the position. With the bundled models these two changed the error by less than 3 %.
     pub fn missing(&self) -> MissingPolicies {
-        self.meta.layout.missing.or(MissingPolicies {
+        let policies = self.meta.layout.missing.or(self.without_effect());
+        policies.or(MissingPolicies {
             position: Missing::Zeros,
             texture2: Missing::CopyTexture1,
             ..MissingPolicies::default()
         })
+    }
+
+    /// Zeros for the feature buffers that neither the network nor its albedo filter takes.
+    pub(crate) fn without_effect(&self) -> MissingPolicies {
+        let takes = |first: usize| {
+            let mut networks = iter::once(self).chain(self.albedo_filter.as_deref());
+            networks.any(|network| network.meta.model.takes_feature(first))
+        };
+        let policy = |buffer: usize| {
+            if takes(COLOR_CHANNELS * buffer) {
+                Missing::Error
+            } else {
+                Missing::Zeros
+            }
+        };
+        let [normal, position, texture1, texture2] = [0, 1, 2, 3].map(policy);
+        MissingPolicies {
+            normal,
+            position,
+            texture1,
+            texture2,
+        }
     }
 
     /// Replaces the albedo filter by `model`, or by the filter of `model` if it has one.
@@ -81,5 +107,36 @@ impl Bundle {
     /// The network and its albedo filter, if it has one.
     pub fn networks(&self) -> impl Iterator<Item = &Bundle> {
         std::iter::once(self).chain(self.albedo_filter.as_deref())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use demc_model::Variant;
+    use demc_model::unet::Guides;
+
+    use super::*;
+    use crate::bundle::testing::{bundle, filtered};
+
+    #[test]
+    fn a_file_may_lack_what_no_network_takes() {
+        let mut unet = bundle(Variant::Unet);
+        unet.meta.model.guides = Guides::Albedo;
+        let expected = [
+            Missing::Zeros,
+            Missing::Zeros,
+            Missing::Error,
+            Missing::Zeros,
+        ];
+        assert_eq!(unet.missing().in_order(), expected);
+        let control = bundle(Variant::ColorOnly);
+        assert_eq!(control.missing().in_order(), [Missing::Zeros; 4]);
+        for takes_all in [
+            bundle(Variant::Semc),
+            bundle(Variant::Kpcn),
+            filtered(Variant::ColorOnly, Variant::Demc),
+        ] {
+            assert_eq!(takes_all.without_effect().in_order(), [Missing::Error; 4]);
+        }
     }
 }

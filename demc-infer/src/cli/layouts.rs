@@ -109,8 +109,9 @@ impl Layouts<'_> {
         file: &ExrFile,
         bundle: &Bundle,
     ) -> Result<(ChannelLayout, Option<String>), Error> {
-        let own = &bundle.meta.layout;
-        let (mut layout, choice) = self.choose_for(file, own, bundle.missing())?;
+        let mut own = bundle.meta.layout.clone();
+        own.missing = own.missing.or(bundle.without_effect());
+        let (mut layout, choice) = self.choose_for(file, &own, bundle.missing())?;
         layout.inputs = own.inputs;
         Ok((layout, choice))
     }

@@ -4,15 +4,20 @@ use std::ffi::OsString;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use burn::tensor::Device;
 use demc_data::image::exr::ExrFile;
 use demc_data::image::plane::Plane;
 use demc_data::image::rewrite::{Replaced, WriteOptions, rewrite_with_layers};
 use demc_data::{ChannelLayout, SamplePrecision, read_frame};
+use demc_infer::{Bundle, BundleMeta, Names, Precision};
 use demc_model::metrics::rel_mse_image;
+use demc_model::{ModelConfig, Variant};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
 use tempfile::TempDir;
 
 use crate::arguments;
-use crate::common::{Outcome, demc_infer, run_directory, sample, sample_image};
+use crate::common::{Outcome, demc_infer, random_bundle, run_directory, sample, sample_image};
 
 fn layout() -> ChannelLayout {
     ChannelLayout::resolve("demc-exr").expect("a preset")
@@ -297,4 +302,35 @@ fn the_help_names_every_renderer() {
     for renderer in ["Mitsuba", "pbrt", "Cycles", "LuxCore", "FBKSD"] {
         assert!(help.contains(renderer), "{renderer}");
     }
+}
+
+/// Blender's file has only the colour of a view layer.
+#[test]
+fn a_network_of_colour_alone_takes_files_of_colour_alone() {
+    let dir = TempDir::new().expect("a directory");
+    let model = ModelConfig {
+        variant: Variant::ColorOnly,
+        width: 2,
+        ..ModelConfig::default()
+    };
+    let normalizer = random_bundle().meta.normalizer;
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    let network = model.init(&mut rng, normalizer.flat_color, &Device::flex());
+    let bundle = Bundle::new(BundleMeta::new(model, normalizer, layout(), 1), network);
+    let path = dir.path().join("colour.safetensors");
+    bundle
+        .save(&path, Names::Burn, Precision::F32)
+        .expect("saved");
+    let file = "../tests/renderers/files/cycles-reference.exr";
+    let image = Path::new(env!("CARGO_MANIFEST_DIR")).join(file);
+    let denoise = |model: &Path| {
+        let output = model.with_extension("exr");
+        let flags = ["denoise", "--model"].map(OsString::from);
+        let files = [model, &image, Path::new("-o"), &output].map(OsString::from);
+        demc_infer(flags.into_iter().chain(files))
+    };
+    denoise(&path).success();
+    assert!(path.with_extension("exr").exists());
+    let with_features = run_directory();
+    denoise(with_features.path()).failure(1, "channel layout of");
 }

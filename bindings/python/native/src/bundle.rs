@@ -58,12 +58,9 @@ impl PyBundle {
 
     /// The feature arrays that the network needs.
     fn required(&self) -> Vec<&'static str> {
-        let model = &self.0.meta.model;
         let policies = FEATURES.into_iter().zip(self.0.missing().in_order());
-        let needed = policies.enumerate().filter(|(index, (_, missing))| {
-            *missing == Missing::Error && model.takes_feature(3 * index)
-        });
-        needed.map(|(_, (name, _))| name).collect()
+        let needed = policies.filter(|(_, missing)| *missing == Missing::Error);
+        needed.map(|(name, _)| name).collect()
     }
 
     /// Whether the network can denoise layers.
