@@ -33,9 +33,9 @@ impl Transfer {
         *self == Transfer::Gamma
     }
 
-    /// The exposure that [`Normalizer::exposure_level`](crate::Normalizer) sets, of planar colour `[3, N]`,
-    /// linear HDR: that of [`ranges::exposure`], or OIDN's, the geometric mean of the luminance of bins.
-    /// 0 for a black image.
+    /// The exposure of planar colour `[3, H, W]`, linear HDR, as [`Normalizer::exposure_level`](crate::Normalizer)
+    /// counts it. It is that of [`ranges::exposure`], or OIDN's: the geometric mean of the luminance of bins.
+    /// A black image has 0.
     ///
     /// # Panics
     /// If the colour does not have `height` x `width` pixels.

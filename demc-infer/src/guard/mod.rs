@@ -73,8 +73,7 @@ impl Bundle {
     /// `(x - mean) / deviation` is [`FARTHEST_RMS`] or more.
     ///
     /// Normals and positions count only where the mask reports a hit, and albedo up to 1, as in the
-    /// statistics.
-    /// Features that the network does not take do not count.
+    /// statistics. Features that the network does not take do not count.
     /// [`denoise`](Self::denoise) starts with this check.
     ///
     /// # Errors

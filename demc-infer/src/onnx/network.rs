@@ -105,8 +105,8 @@ impl GraphBuilder {
         least[..POSITIONS].fill(-1.0);
         least[TEXTURES..].fill(0.0);
         let least = self.constant("features_min", &[1, FEATURE_CHANNELS, 1, 1], &least);
-        let above = self.node("Min", "features_below", &[&raw, &most], &[]);
-        self.node("Max", "features_clamped", &[&above, &least], &[])
+        let below = self.node("Min", "features_below", &[&raw, &most], &[]);
+        self.node("Max", "features_clamped", &[&below, &least], &[])
     }
 
     /// `(clamp(albedo, 0, 1) + epsilon)^(1/gamma)` with the albedo of the first hit

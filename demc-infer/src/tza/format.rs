@@ -1,8 +1,8 @@
 //! TZA, the file format of Open Image Denoise's weights, version 2.
 //!
 //! Little-endian. The file starts with the number 0x41D7, the version in two bytes, and the offset of the
-//! table as 64 bits. The table starts with the count of tensors. Each entry has the length of its name and
-//! the name, the number of axes, their lengths, a letter for each (`oihw` or `x`), the type (`h` for half,
+//! table as 64 bits. The table starts with the count of tensors. Each entry has a name after its length, and
+//! the number of axes. Then come the axes' lengths, a letter for each (`oihw` or `x`), the type (`h` for half,
 //! `f` for float), and the offset of the values. The values start at multiples of 64 bytes.
 
 use demc_model::Weight;

@@ -1,7 +1,7 @@
 //! The forward pass of a U-Net, level by level, large maps in bands of rows.
 //!
-//! No map of the full resolution is whole but those of the input and the output: a band of the encoder's
-//! first level is pooled, and a band of the decoder's last level is made from the map below and the input.
+//! At the full resolution only the input and the output are whole. A band of the encoder's first level is
+//! pooled at once. A band of the decoder's last level is made from the map below and the input.
 
 use std::ops::Range;
 

@@ -6,8 +6,8 @@ use crate::unet::{UNET_LEVELS, UnetSpec};
 
 /// As [`peak_bytes`](super::peak_bytes), for a U-Net. Both sides are multiples of 16.
 ///
-/// Each level is a phase. It holds the images, the maps that later levels append, the map that it reads,
-/// the map that it writes, a band of its convolutions, and their prepared weights.
+/// Each level is a phase. It holds the images, and the maps that it reads, writes, and keeps for later levels.
+/// A band of its convolutions and their prepared weights come on top.
 pub(super) fn unet_bytes(config: &ModelConfig, height: usize, width: usize) -> u64 {
     let estimate = UnetEstimate {
         spec: config.size.spec(),
