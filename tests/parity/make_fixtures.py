@@ -6,6 +6,7 @@ depend on the machine, and tests measure the error of the Rust side. Tensors hav
 - `inputs.safetensors`: one batch, `color_gamma`, `features_z`, `reference_hdr`.
 - `VARIANT-READING.safetensors` and, with a kernel head, `demc-READING-kernel.safetensors`: `weight/*`, `output_eval` and, in train mode, `output_train`, `loss`, `grad/*`, and
   `adam/*`: weights and running statistics after 5 steps of Adam on the same batch.
+- `unet.safetensors`: the same for the small U-Net of Open Image Denoise.
 - `kpcn.safetensors`: inputs, `weight/*`, `output`, and for both losses of KPCN the loss and `grad/*`.
 - `blocks.safetensors`: inputs, outputs and gradients of single blocks of `demc-*`, for the loss
   `sum(outputs * probes)`; and the loss function on its own.
@@ -22,9 +23,9 @@ import torch
 from safetensors.numpy import save
 from torch import Tensor, nn
 
-from demc.torch import Denoiser, Kpcn, ModelConfig, hdr_from_gamma, rel_mse
+from demc.torch import Denoiser, Kpcn, ModelConfig, Unet, hdr_from_gamma, rel_mse
 from demc.torch.kpcn import joined_hdr, separate_loss
-from demc.torch.network import READINGS, VARIANTS
+from demc.torch.network import READINGS, UNET, VARIANTS
 
 FIXTURES = Path(__file__).parent / "fixtures"
 WIDTH = 2
@@ -34,6 +35,7 @@ SEEDS = {  # found by trial, because the checks reject some seeds; 0 where none 
     "demc-released-kernel": 2,
     "semc-paper": 1,
     "kpcn": 7,
+    "unet": 8,
 }
 STEPS, LEARNING_RATE = 5, 1e-3
 MARGIN = 0.2  # share of the Rust tests' tolerances that float32 rounding may use up
@@ -53,16 +55,27 @@ def main() -> None:
             for head in ("grey", "kernel") if variant == "demc" else ("grey",):
                 config = ModelConfig(variant, reading, WIDTH, head=head)
                 name = f"{variant}-{reading}" + ("-kernel" if head == "kernel" else "")
-                weights = draw_weights(config, batch, np.random.RandomState(SEEDS.get(name, 0)))
-                results = run(config, weights, batch, torch.float64)
-                check_alive(config, results)
-                worst = check_robust(config, results, run(config, weights, batch, torch.float32))
-                print(f"{name}: float32 takes at most {worst:.3f} of a tolerance")
-                write(name, {f"weight/{key}": value for key, value in weights.items()} | results)
+                weights = write_network(name, config, batch)
                 if variant == "demc" and head == "grey":
                     blocks |= blocks_of(config, weights)
     write("blocks", blocks)
     write("kpcn", kpcn(np.random.RandomState(SEEDS["kpcn"])))
+    write_network("unet", ModelConfig(UNET, size="small"), batch)
+
+
+def write_network(name: str, config: ModelConfig, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Draws the weights of a network, writes its fixture, and returns the weights."""
+    weights = draw_weights(config, batch, np.random.RandomState(SEEDS.get(name, 0)))
+    results = run(config, weights, batch, torch.float64)
+    check_alive(config, results)
+    worst = check_robust(config, results, run(config, weights, batch, torch.float32))
+    print(f"{name}: float32 takes at most {worst:.3f} of a tolerance")
+    write(name, {f"weight/{key}": value for key, value in weights.items()} | results)
+    return weights
+
+
+def network(config: ModelConfig) -> Denoiser | Unet:
+    return Unet(config) if config.variant == UNET else Denoiser(config)
 
 
 def write(name: str, tensors: dict[str, Tensor]) -> None:
@@ -88,7 +101,7 @@ def draw_batch(random: np.random.RandomState) -> dict[str, Tensor]:
 def draw_weights(config: ModelConfig, batch: dict[str, Tensor], random: np.random.RandomState) -> dict[str, Tensor]:
     """Random weights, calibrated by one pass. It shifts and scales each convolution so that every channel of its output
     has a mean near 0.75 and a standard deviation of 0.7. Without it, half of a network of width 2 would be dead."""
-    model = Denoiser(config).double().eval()
+    model = network(config).double().eval()
     ranges = {"running_mean": (0.4, 1.0), "running_var": (0.3, 0.8), "weight": (0.5, 0.9), "bias": (0.6, 0.9)}
     for name, value in model.state_dict().items():
         shape, limits = tuple(value.shape), ranges[name.split(".")[-1]]
@@ -112,6 +125,8 @@ def draw_weights(config: ModelConfig, batch: dict[str, Tensor], random: np.rando
 
 def zero_by_construction(config: ModelConfig, name: str) -> bool:
     """Whether this is a bias before a batch normalisation, which cancels the bias with the mean."""
+    if config.variant == UNET:
+        return False
     normed = ("deconv.bias", "latent.conv.bias") if READINGS[config.reading].norm else ()
     return name.endswith(("fusion.blocks.1.conv.bias", "fusion.blocks.2.conv.bias", *normed))
 
@@ -120,7 +135,7 @@ def run(
     config: ModelConfig, weights: dict[str, Tensor], batch: dict[str, Tensor], dtype: torch.dtype
 ) -> dict[str, Tensor]:
     """The contents of a fixture besides the weights: both outputs, the loss, gradients, and the result of Adam."""
-    model = Denoiser(config)
+    model = network(config)
     model.load_state_dict(weights, strict=True)
     model.to(dtype)
     color, features, reference = (batch[name].to(dtype) for name in ("color_gamma", "features_z", "reference_hdr"))

@@ -312,26 +312,28 @@ mod tests {
         );
     }
 
-    /// Tests run in the folder of their crate, but `base` starts at that of the workspace.
+    /// Tests run in the folder of their crate, but the paths of the files start at that of the workspace.
     #[test]
     fn the_ablations_of_the_repository_are_valid() {
-        let workspace = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/.."));
+        let workspace = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
         let no_albedo = "color-only: data.albedo_demodulation_epsilon: absent instead of 0.07";
-        for (folder, differences) in [("configs", vec![no_albedo]), ("results/renders", vec![])] {
-            let folder = workspace.join(folder);
-            let text = std::fs::read_to_string(folder.join("ablation.toml")).unwrap();
-            let relative = text
-                .lines()
-                .find(|line| line.starts_with("base = "))
-                .unwrap();
-            let base = workspace.join(relative.split('"').nth(1).unwrap());
+        let networks = ["DEMC", "DEMCnoSN", "SEMC"];
+        for (file, last, differences) in [
+            ("configs/ablation.toml", "color-only", vec![no_albedo]),
+            ("configs/paper/figure10.toml", "KPCN", vec![]),
+            ("results/comparison/project.toml", "", vec![]),
+            ("results/comparison/scaling.toml", "", vec![]),
+        ] {
+            let text = std::fs::read_to_string(Path::new(workspace).join(file)).unwrap();
             let dir = tempfile::tempdir().unwrap();
             let path = dir.path().join("ablation.toml");
-            std::fs::write(&path, text.replace(relative, &format!("base = {base:?}"))).unwrap();
+            let absolute = format!("\"{workspace}/configs/");
+            std::fs::write(&path, text.replace("\"configs/", &absolute)).unwrap();
             let spec = AblationSpec::load(&path, &[]).unwrap();
-            let names: Vec<_> = spec.variants.iter().map(|v| &v.name).collect();
-            assert_eq!(names, ["DEMC", "DEMCnoSN", "SEMC", "color-only"]);
-            assert_eq!(spec.differences(), differences);
+            let names: Vec<_> = spec.variants.iter().map(|v| v.name.as_str()).collect();
+            assert_eq!(names[..3], networks, "{file}");
+            assert_eq!(names[3..].join(" "), last, "{file}");
+            assert_eq!(spec.differences(), differences, "{file}");
         }
     }
 
