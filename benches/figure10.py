@@ -29,7 +29,7 @@ NETWORKS = {"DEMC": "demc", "KPCN": "kpcn"}
 
 
 def said(*command: object) -> str:
-    return subprocess.run([*map(str, command)], check=True, capture_output=True, text=True).stdout
+    return subprocess.run([*map(str, command)], check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
 def seconds(*command: object) -> float:
@@ -49,10 +49,10 @@ def enlarged(source: Path, target: Path) -> None:
         file.write(str(target))
 
 
-def trained(variant: str, data: Path, folder: Path) -> Path:
-    """The run directory of one training step."""
+def trained(variant: str, folder: Path) -> Path:
+    """The run directory of one training step on the data set of the folder."""
     run = folder / variant
-    settings = [f"data.root={data}", "data.batch_size=1", "data.validation=0", "train.steps=1", "loss.separate=0"]
+    settings = [f"data.root={folder}", "data.batch_size=1", "data.validation=0", "train.steps=1", "loss.separate=0"]
     sets = [word for setting in settings for word in ("--set", setting)]
     said(PROGRAMS / "demc-train", "--config", ROOT / f"configs/paper/{variant}.toml", *sets, "--run-dir", run)
     return run
@@ -70,13 +70,16 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="data set of `tools/render --passes paper`")
     parser.add_argument("--rounds", type=int, default=3, metavar="N", help="rounds [3]")
     args = parser.parse_args()
-    scenes = json.loads((args.data / "manifest.json").read_text())["scenes"]
-    view = next(scene["file"] for scene in scenes if scene["split"] == "test")
+    manifest = json.loads((args.data / "manifest.json").read_text())
+    view = next(scene for scene in manifest["scenes"] if scene["split"] == "test")
+    file = (args.data / view["file"]).resolve()
+    single = manifest | {"scenes": [view | {"split": "train", "file": str(file)}]}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         image, output = folder / "image.exr", folder / "output.exr"
-        enlarged(args.data / view, image)
-        models = {name: ["--model", trained(variant, args.data, folder)] for name, variant in NETWORKS.items()}
+        (folder / "manifest.json").write_text(json.dumps(single))
+        enlarged(file, image)
+        models = {name: ["--model", trained(variant, folder)] for name, variant in NETWORKS.items()}
         denoise = PROGRAMS / "demc-infer", "denoise", image, "-o", output, "--overwrite"
         ways = {name: (lambda how=how: seconds(*denoise, *how)) for name, how in (models | {"NFOR": ["--filter", "nfor"]}).items()}
         ways["OIDN, `high`"] = lambda: oidn("high")

@@ -166,6 +166,15 @@ pub struct VariantSpec {
     pub pads_with_zeros: bool,
 }
 
+/// What most rows share: the paper's values.
+const PAPER: VariantSpec = VariantSpec {
+    name: "",
+    encoders: &[],
+    color_channels: COLOR_CHANNELS,
+    halvings: LEVELS,
+    pads_with_zeros: false,
+};
+
 impl VariantSpec {
     /// Whether the variant has the fusion sub-network: whether an encoder takes the detail map as
     /// input.
@@ -222,44 +231,33 @@ impl Variant {
             Variant::Demc => &VariantSpec {
                 name: "demc",
                 encoders: &[&[Input::DetailMap], &[Input::Color]],
-                color_channels: COLOR_CHANNELS,
-                halvings: LEVELS,
-                pads_with_zeros: false,
+                ..PAPER
             },
             Variant::DemcNosn => &VariantSpec {
                 name: "demc-nosn",
                 encoders: &[&[Input::Features], &[Input::Color]],
-                color_channels: COLOR_CHANNELS,
-                halvings: LEVELS,
-                pads_with_zeros: false,
+                ..PAPER
             },
             Variant::Semc => &VariantSpec {
                 name: "semc",
                 encoders: &[&[Input::DetailMap, Input::Color]],
-                color_channels: COLOR_CHANNELS,
-                halvings: LEVELS,
-                pads_with_zeros: false,
+                ..PAPER
             },
             Variant::ColorOnly => &VariantSpec {
                 name: "color-only",
                 encoders: &[&[Input::Color]],
-                color_channels: COLOR_CHANNELS,
-                halvings: LEVELS,
-                pads_with_zeros: false,
+                ..PAPER
             },
             Variant::Kpcn => &VariantSpec {
                 name: "kpcn",
-                encoders: &[],
                 color_channels: 2 * COLOR_CHANNELS,
-                halvings: LEVELS,
-                pads_with_zeros: false,
+                ..PAPER
             },
             Variant::Unet => &VariantSpec {
                 name: "unet",
-                encoders: &[],
-                color_channels: COLOR_CHANNELS,
                 halvings: UNET_LEVELS,
                 pads_with_zeros: true,
+                ..PAPER
             },
         }
     }

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from demc.torch import Denoiser, Kpcn, ModelConfig, Unet, hdr_from_gamma, rel_mse
 from demc.torch.kpcn import joined_hdr, separate_loss
-from demc.torch.network import READINGS, UNET, VARIANTS
+from demc.torch.config import READINGS, UNET, VARIANTS
 
 FIXTURES = Path(__file__).parent / "fixtures"
 WIDTH = 2

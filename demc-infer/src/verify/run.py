@@ -31,44 +31,30 @@ def torch(file):
 
 
 def oidn(file):
-    import ctypes
-
     import pyoidn
+    from pyoidn.capi import oidn_Capi, oidn_ffi
 
-    folder = Path(pyoidn.__file__).parent / "oidn" / "lib"
-    library = ctypes.CDLL(str(next(path for path in sorted(folder.iterdir()) if "OpenImageDenoise.so" in path.name)))
-    for name, result in (("oidnNewDevice", ctypes.c_void_p), ("oidnNewFilter", ctypes.c_void_p)):
-        getattr(library, name).restype = result
-    pointer, size, text = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_char_p
-    library.oidnCommitDevice.argtypes = [pointer]
-    library.oidnNewFilter.argtypes = [pointer, text]
-    library.oidnSetSharedFilterImage.argtypes = [pointer, text, pointer, ctypes.c_int, size, size, size, size, size]
-    library.oidnSetSharedFilterData.argtypes = [pointer, text, pointer, size]
-    library.oidnSetFilterBool.argtypes = [pointer, text, ctypes.c_bool]
-    for function in (library.oidnCommitFilter, library.oidnExecuteFilter, library.oidnReleaseFilter):
-        function.argtypes = [pointer]
-    library.oidnGetDeviceError.argtypes = [pointer, ctypes.POINTER(text)]
-    weights = numpy.fromfile(file, numpy.uint8)
-    cpu, float3 = 1, 3
-    device = library.oidnNewDevice(cpu)
-    library.oidnCommitDevice(device)
+    # `pyoidn` has no method for weights.
+    oidn_ffi.cdef("void oidnSetSharedFilterData(OIDNFilter filter, const char* name, void* data, size_t size);")
+    weights = Path(file).read_bytes()
+    device = pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CPU)
+    device.commit()
 
     def denoise(color, features):
         planes = {"color": color, "albedo": features[6:9], "normal": features[:3], "output": numpy.empty_like(color)}
         images = {name: numpy.ascontiguousarray(image.transpose(1, 2, 0)) for name, image in planes.items()}
-        handle = library.oidnNewFilter(device, b"RT")
+        filter = pyoidn.Filter(device, "RT")
         for name in ("color", *guides, "output"):
-            height, width, _ = images[name].shape
-            data = images[name].ctypes.data
-            library.oidnSetSharedFilterImage(handle, name.encode(), data, float3, width, height, 0, 0, 0)
-        library.oidnSetFilterBool(handle, b"hdr", True)
-        library.oidnSetSharedFilterData(handle, b"weights", weights.ctypes.data, weights.nbytes)
-        library.oidnCommitFilter(handle)
-        library.oidnExecuteFilter(handle)
-        library.oidnReleaseFilter(handle)
-        message = text()
-        if library.oidnGetDeviceError(device, ctypes.byref(message)):
-            raise RuntimeError(message.value.decode())
+            filter.set_image(name, images[name], pyoidn.OIDN_FORMAT_FLOAT3)
+        filter.set_bool("hdr", True)
+        data = oidn_ffi.from_buffer(weights)
+        oidn_Capi.oidnSetSharedFilterData(filter._filter, b"weights", data, len(weights))
+        filter.commit()
+        filter.execute()
+        error = device.get_error()
+        filter.release()
+        if error is not None:
+            raise RuntimeError(error)
         return images["output"].transpose(2, 0, 1)
 
     version = "Open Image Denoise of pyoidn"

@@ -9,20 +9,22 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .bundle import Bundle, load
+    from .config import ModelConfig
     from .exr import Frame, read_exr
     from .metrics import gamma_from_hdr, hdr_from_gamma, rel_mse
     from .kpcn import Kpcn
-    from .network import Denoiser, ModelConfig
+    from .network import Denoiser
     from .unet import Unet
 
 _MODULES = {
     "bundle": ["Bundle", "load"],
+    "config": ["ModelConfig"],
     "exr": ["Frame", "read_exr"],
     "kpcn": ["Kpcn"],
     "layouts": [],
     "light": [],
     "metrics": ["gamma_from_hdr", "hdr_from_gamma", "rel_mse"],
-    "network": ["Denoiser", "ModelConfig"],
+    "network": ["Denoiser"],
     "preprocess": [],
     "transfer": [],
     "unet": ["Unet"],

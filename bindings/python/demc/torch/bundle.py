@@ -22,9 +22,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from . import light, preprocess, transfer
+from .config import KPCN, UNET, ModelConfig
 from .kpcn import Kpcn
 from .metrics import gamma_from_hdr
-from .network import KPCN, UNET, Denoiser, ModelConfig
+from .network import Denoiser
 from .preprocess import FEATURES, layer_color
 from .unet import Unet
 

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from .network import DARKEST, ModelConfig, filtered
+from .config import ModelConfig
+from .network import DARKEST, filtered
 
 LAYERS = 9
 """Convolutions of a network."""

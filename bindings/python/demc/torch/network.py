@@ -11,17 +11,15 @@ figure numbers are the paper's.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from .preprocess import FEATURES, SIZE_MULTIPLE
+from .config import READINGS, VARIANTS, ModelConfig, Reading
+from .preprocess import FEATURES
 
-LEVEL_FACTORS = (1, 2, 4, 8, 8)
-"""The paper's channels of the levels, in units of the base width (Fig. 3)."""
 BN_EPSILON = 1e-3
 """TensorFlow's default, which the authors' code uses."""
 BN_MOMENTUM = 0.01
@@ -38,93 +36,7 @@ KERNEL_GAMMA = 2.2
 """Exponent of the colour compression that a kernel head undoes."""
 DARKEST = 1e-8
 """Smaller outputs of a kernel head, in linear light, count as black."""
-
-
-@dataclass(frozen=True)
-class Variant:
-    """A network variant: fusion sub-network or not, and the inputs of each encoder.
-
-    The last encoder feeds the latent.
-    """
-
-    fusion: bool
-    encoders: tuple[tuple[str, ...], ...]
-
-
-VARIANTS = {
-    "demc": Variant(fusion=True, encoders=(("detail",), ("color",))),
-    "demc-nosn": Variant(fusion=False, encoders=(("features",), ("color",))),  # Sec. 4.3
-    "semc": Variant(fusion=True, encoders=(("detail", "color"),)),  # Sec. 4.4, Fig. 4
-    "color-only": Variant(fusion=False, encoders=(("color",),)),  # ours: a control
-}
-KPCN = "kpcn"
-"""The networks of `kpcn.Kpcn`."""
-UNET = "unet"
-"""The network of `unet.Unet`."""
 CHANNELS = {"detail": 3, "color": 3, "features": FEATURES}
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Details in which the paper's text and the authors' published model differ."""
-
-    convs: tuple[int, ...]  # convolutions of each encoder level
-    skip_after: tuple[int, ...]  # the skip is taken after this many of them
-    norm: bool  # BatchNorm in the latent and after each deconvolution
-    fuse_relu: bool  # ReLU after the 1x1 skip fusion
-    head_kernel: int  # side of the output convolution's kernel
-
-
-READINGS = {
-    "paper": Reading(convs=(3, 3, 3, 3, 3), skip_after=(2, 2, 2, 2, 2), norm=False, fuse_relu=True, head_kernel=1),
-    "released": Reading(convs=(2, 2, 3, 3, 3), skip_after=(2, 2, 3, 3, 3), norm=True, fuse_relu=False, head_kernel=3),
-}
-
-
-@dataclass(frozen=True)
-class ModelConfig:
-    """The `model` part of a bundle's metadata.
-
-    `head` "kernel" predicts kernels (`kernel_head`). "grey" and "xavier", and `detail`, are initialisations.
-    """
-
-    variant: str = "demc"
-    reading: str = "paper"
-    width: int = 64
-    levels: tuple[int, ...] = LEVEL_FACTORS
-    head: str = "grey"
-    detail: str = "open"
-    size: str = "base"  # of a U-Net: small, base, or large
-    guides: str = "albedo-normal"  # of a U-Net: none, albedo, or albedo-normal
-
-    def __post_init__(self) -> None:
-        for what, value, known in (
-            ("variant", self.variant, (*VARIANTS, KPCN, UNET)),
-            ("reading", self.reading, READINGS),
-            ("head", self.head, ("grey", "xavier", "kernel")),
-            ("detail", self.detail, ("open", "xavier")),
-            ("size", self.size, ("small", "base", "large")),
-            ("guides", self.guides, ("none", "albedo", "albedo-normal")),
-        ):
-            if value not in known:
-                raise ValueError(f"unknown {what} {value!r}: expected one of {', '.join(known)}")
-        if self.width < 1:
-            raise ValueError(f"width is {self.width}: expected at least 1")
-        object.__setattr__(self, "levels", tuple(self.levels))  # JSON has lists
-        if len(self.levels) != len(LEVEL_FACTORS) or min(self.levels) < 1:
-            raise ValueError(f"levels is {self.levels}: expected five numbers of at least 1")
-
-    @property
-    def level_channels(self) -> list[int]:
-        """Channels of each level, from the full resolution down."""
-        return [self.width * factor for factor in self.levels]
-
-    def __str__(self) -> str:
-        """A short name; includes the levels if they are not the paper's."""
-        if self.variant == KPCN:
-            return f"{self.variant}, width {self.width}"
-        levels = "" if self.levels == LEVEL_FACTORS else f", levels of {self.level_channels}"
-        return f"{self.variant}, {self.reading} reading, width {self.width}{levels}"
 
 
 class BatchNorm(nn.Module):

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from .network import ModelConfig
+from .config import ModelConfig
 
 SIZES = {
     "small": (((32, 32), (32,), (32,), (32,)), (32, 32), ((64, 64), (64, 64), (64, 32), (32, 32))),
