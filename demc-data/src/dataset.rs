@@ -65,9 +65,18 @@ pub struct Scene {
     pub ref_residual_relmse: Option<f64>,
     /// How often an epoch of training takes its patches.
     pub repeat: NonZero<u8>,
+    /// The channel layout of its file, if that is not the data set's: see [`layout`](Self::layout).
+    pub layout: Option<ChannelLayout>,
     /// The other keys of its manifest entry: licences, credits, render
     /// settings, the denoiser of the reference.
     pub other: serde_json::Map<String, serde_json::Value>,
+}
+
+impl Scene {
+    /// The channel layout of its file, in a data set with the layout `of_set`.
+    pub fn layout<'a>(&'a self, of_set: &'a ChannelLayout) -> &'a ChannelLayout {
+        self.layout.as_ref().unwrap_or(of_set)
+    }
 }
 
 /// A data set whose manifest and file headers were checked.
@@ -101,6 +110,7 @@ struct ManifestScene {
     ref_residual_relmse: Option<f64>,
     #[serde(default = "once")]
     repeat: NonZero<u8>,
+    layout: Option<String>,
     #[serde(flatten)]
     other: serde_json::Map<String, serde_json::Value>,
 }
@@ -111,12 +121,16 @@ fn once() -> NonZero<u8> {
 
 impl Dataset {
     /// Opens `root/manifest.json` and checks every scene's file: it exists, has the size in the
-    /// manifest, and holds the channels of `layout`, including the reference. Decodes no pixels.
+    /// manifest, and holds the channels of its own layout or else of `layout`, including the reference. Decodes
+    /// no pixels.
     ///
     /// # Errors
     /// [`FileError::Read`] without a manifest, otherwise [`Error::Dataset`] with all problems.
     pub fn open(root: &Path, layout: &ChannelLayout) -> Result<Self, Error> {
-        let scenes = Self::list(root)?;
+        let mut scenes = Self::list(root)?;
+        for own in scenes.iter_mut().filter_map(|scene| scene.layout.as_mut()) {
+            own.inputs = layout.inputs;
+        }
         let mut problems = manifest_problems(&scenes);
         if layout.reference.is_none() {
             problems.push("the layout names no reference, which training needs".to_owned());
@@ -218,28 +232,37 @@ fn parse(root: &Path, text: &str) -> Result<Vec<Scene>, String> {
         }
     }
     let Manifest { scenes } = serde_json::from_str(text).map_err(problem)?;
-    let scene = |entry: ManifestScene| Scene {
-        name: entry.name,
-        split: entry.split,
-        base: entry.base,
-        path: root.join(entry.file),
-        width: entry.width,
-        height: entry.height,
-        ref_residual_relmse: entry.ref_residual_relmse,
-        repeat: entry.repeat,
-        other: entry.other,
+    let scene = |entry: ManifestScene| {
+        let layout = |name: String| {
+            ChannelLayout::preset(&name)
+                .ok_or_else(|| format!("scene {}: layout {name:?} is no preset", entry.name))
+        };
+        Ok(Scene {
+            layout: entry.layout.map(layout).transpose()?,
+            name: entry.name,
+            split: entry.split,
+            base: entry.base,
+            path: root.join(entry.file),
+            width: entry.width,
+            height: entry.height,
+            ref_residual_relmse: entry.ref_residual_relmse,
+            repeat: entry.repeat,
+            other: entry.other,
+        })
     };
-    Ok(scenes.into_iter().map(scene).collect())
+    scenes.into_iter().map(scene).collect()
 }
 
-/// The preset that fits the first readable file of a data set, or `demc-exr` if none fits.
+/// The preset that fits the first readable file of a data set without a layout of its own, or `demc-exr` if
+/// none fits.
 pub fn preset_of(scenes: &[Scene]) -> &'static str {
     let fitting = |scene: &Scene| {
         let file = ExrFile::open(&scene.path).ok()?;
         let found = detect(&file, MissingPolicies::default(), None).ok()?;
         Some(found.preset)
     };
-    scenes.iter().find_map(fitting).unwrap_or("demc-exr")
+    let mut scenes = scenes.iter().filter(|scene| scene.layout.is_none());
+    scenes.find_map(fitting).unwrap_or("demc-exr")
 }
 
 fn manifest_problems(scenes: &[Scene]) -> Vec<String> {
@@ -313,7 +336,7 @@ fn missing_channels(error: &Error) -> Option<&[String]> {
 }
 
 fn file_error(scene: &Scene, layout: &ChannelLayout) -> Option<Error> {
-    match check_header(&scene.path, layout, Presence::Required) {
+    match check_header(&scene.path, scene.layout(layout), Presence::Required) {
         Ok(window) => size_mismatch(scene, window.width, window.height),
         Err(error) => Some(error),
     }

@@ -104,7 +104,7 @@ impl SceneCache {
         let scene = &self.scenes[index];
         let mut planes = FramePlanes::read(
             &scene.path,
-            &self.layout,
+            scene.layout(&self.layout),
             Presence::Required,
             Presence::Skip,
         )?;

@@ -133,6 +133,7 @@ mod tests {
             height,
             ref_residual_relmse: None,
             repeat: NonZero::<u8>::MIN,
+            layout: None,
             other: serde_json::Map::new(),
         }
     }

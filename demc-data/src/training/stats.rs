@@ -132,6 +132,7 @@ impl SceneSums {
         config: &DataConfig,
         relmse_epsilon: f64,
     ) -> Result<Self, Error> {
+        let layout = scene.layout(layout);
         let mut planes =
             FramePlanes::read(&scene.path, layout, Presence::Required, Presence::Required)?;
         if let Some(error) = size_mismatch(scene, planes.width, planes.height) {

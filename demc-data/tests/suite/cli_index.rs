@@ -5,7 +5,7 @@ use std::path::Path;
 
 use crate::cli_datasets::{Dir, refused};
 use crate::support::program::stdout;
-use crate::support::{scene_channels, write};
+use crate::support::{sample, scene_channels, write};
 use demc_data::{ChannelLayout, Dataset, Split};
 use serde_json::json;
 
@@ -196,4 +196,51 @@ fn index_refuses_unusable_sets_and_writes_nothing() {
         "plain.exr: not a readable OpenEXR file",
     );
     assert!(!dir.path("manifest.json").exists());
+}
+
+/// Cycles' own channels beside files of this project's layout.
+#[test]
+fn index_lists_training_scenes_of_another_set_with_their_layout() {
+    let dir = Dir::new();
+    let renderers = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/renderers/files");
+    let file = |name: &str| renderers.join(name).display().to_string();
+    fs::create_dir(dir.path("own")).expect("writable");
+    let [noisy, reference] = ["cycles-5.0.exr", "cycles-reference.exr"].map(file);
+    let reference = format!("ref={reference}");
+    let merged = dir.text("own/shot.exr");
+    let strip = ["--strip", "ViewLayer.Combined"];
+    stdout(&[&["merge", "-o", &merged, &noisy, &reference], &strip[..]].concat());
+    let sample = sample();
+    let with = ["--with", sample.to_str().expect("UTF-8")];
+    let own = dir.text("own");
+    let text = stdout(&[&["index", &own], &with[..]].concat());
+    assert!(
+        text.contains("layout cycles; training scenes of --with: 10"),
+        "{text}"
+    );
+    let layout = ChannelLayout::resolve("cycles").expect("a preset");
+    let set = Dataset::open(&dir.path("own"), &layout).expect("a data set of two layouts");
+    let own_layouts = set.scenes.iter().filter(|scene| scene.layout.is_some());
+    assert_eq!((set.scenes.len(), own_layouts.count()), (11, 10));
+    assert!(set.scenes.iter().all(|scene| scene.split == Split::Train));
+    let text = stdout(&["stats", &own]);
+    assert!(text.contains("11"), "{text}");
+    stdout(&["doctor", &own, "--patch-size", "64"]);
+    // Again: the entries are replaced, not repeated.
+    let again = stdout(&[&["index", &own, "--overwrite"], &with[..]].concat());
+    assert!(again.contains("training scenes of --with: 10"), "{again}");
+    assert!(!again.contains("kept"), "{again}");
+    let twice = [&["index", &own, "--overwrite"], &with[..], &with[..]].concat();
+    refused(&twice, 1, "several scenes have the name");
+}
+
+#[test]
+fn a_scene_with_an_unknown_layout_is_refused() {
+    let dir = Dir::new();
+    dir.scene("a.exr");
+    let scene = json!({"name": "a", "split": "train", "base": "a", "file": "a.exr", "width": 4, "height": 2, "layout": "mine"});
+    let manifest = json!({"format": "demc-exr 1", "scenes": [scene]});
+    fs::write(dir.path("manifest.json"), manifest.to_string()).expect("writable");
+    let expected = "scene a: layout \"mine\" is no preset";
+    refused(&["stats", &dir.text("")], 1, expected);
 }

@@ -155,13 +155,14 @@ impl Layouts<'_> {
         Ok((found.layout, Some(choice)))
     }
 
-    /// The layout of a data set: that of its first file.
+    /// The layout of a data set: that of its first file whose scene names none.
     ///
     /// # Errors
     /// As [`Dataset::list`] and [`of`](Self::of).
     pub fn of_dataset(&self, root: &Path, bundle: &Bundle) -> anyhow::Result<ChannelLayout> {
         let scenes = Dataset::list(root)?;
-        let first = scenes.first().map(|scene| ExrFile::open(&scene.path));
+        let first = scenes.iter().find(|scene| scene.layout.is_none());
+        let first = first.map(|scene| ExrFile::open(&scene.path));
         Ok(match (&self.given, first) {
             (None, Some(Ok(file))) => self.of(&file, bundle, say)?,
             // Opening the data set names what is wrong with its files.

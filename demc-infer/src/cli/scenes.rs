@@ -208,7 +208,7 @@ impl Scenes {
         layout: &ChannelLayout,
         clamped: &mut Clamped,
     ) -> anyhow::Result<SceneFiles> {
-        let mut frame = demc_data::read_frame(&scene.path, layout)?;
+        let mut frame = demc_data::read_frame(&scene.path, scene.layout(layout))?;
         frame.name.clone_from(&scene.name);
         clamped.count(frame.clamped);
         let mut baselines = Vec::with_capacity(self.baselines.len());

@@ -190,10 +190,11 @@ impl TrainingData {
         let present = Presence::IfPresent;
         for scene in validation.iter().chain(&test) {
             // Now, not after days of training.
+            let layout = scene.layout(&layout);
             let mut file = ExrFile::open(&scene.path)?;
-            let planes = FramePlanes::decode(&mut file, &layout, present, present)?;
+            let planes = FramePlanes::decode(&mut file, layout, present, present)?;
             clamped += planes.clamped as u64;
-            suspicious.push((scene.name.clone(), content::suspicious(&planes, &layout)));
+            suspicious.push((scene.name.clone(), content::suspicious(&planes, layout)));
         }
         // The files were just read, so the system has them in memory.
         let checksums = checksums(train.iter().chain(&validation).chain(&test))?;

@@ -71,7 +71,7 @@ pub fn score(
 }
 
 fn score_scene(bundle: &Bundle, scene: &Scene, draws: bool) -> anyhow::Result<SceneResult> {
-    let frame = read_frame(&scene.path, &bundle.meta.layout)?;
+    let frame = read_frame(&scene.path, scene.layout(&bundle.meta.layout))?;
     let denoised = bundle.denoise(&frame)?;
     let (mut zeros, mut bright) = (0, 0);
     for (out, reference) in denoised.iter().zip(frame.reference.iter().flatten()) {

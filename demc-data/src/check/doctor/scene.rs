@@ -29,6 +29,7 @@ pub(super) fn examine(
     layout: &ChannelLayout,
     patch_size: usize,
 ) -> (Vec<Finding>, Option<Image>) {
+    let layout = scene.layout(layout);
     let mut findings = Vec::new();
     let mut frame = read_pair(&scene.path, layout, false);
     if let Err(error @ Error::NonFinite { .. }) = &frame {

@@ -1,5 +1,6 @@
 //! `demc-data index`.
 
+mod beside;
 mod found;
 mod rules;
 
@@ -21,7 +22,7 @@ use rules::{Entry, Kept, Rules};
 
 #[derive(Args)]
 #[command(
-    after_help = "Examples:\n  demc-data index renders --test 'kitchen*'\n  demc-data index renders --test 'bath/*' --base '^([^/]+)/'"
+    after_help = "Examples:\n  demc-data index renders --test 'kitchen*'\n  demc-data index renders --test 'bath/*' --base '^([^/]+)/'\n  demc-data index own --with data/sample"
 )]
 pub struct Arguments {
     /// Directory of the scenes
@@ -37,6 +38,9 @@ pub struct Arguments {
     /// Channel layout: a preset or a TOML file; by default the preset that fits each file
     #[arg(long, value_name = "PRESET|FILE")]
     layout: Option<String>,
+    /// Data set whose training scenes are also listed (repeatable). Its files may have another layout
+    #[arg(long = "with", value_name = "DIR")]
+    beside: Vec<PathBuf>,
     /// Replace an existing manifest. Keys of its scenes that this command does not set stay, the splits without
     /// --test, and the base scenes without --base
     #[arg(long)]
@@ -72,6 +76,12 @@ impl Arguments {
         let count = |split: Split| scenes.iter().filter(|scene| scene.split == split).count();
         let bases: BTreeSet<&str> = scenes.iter().map(|scene| scene.base.as_str()).collect();
         let mut entries: Vec<Value> = scenes.iter().map(|scene| before.entry(scene)).collect();
+        let beside = beside::entries(&self.root, &self.beside, &found[0].layout)?;
+        let names = entries.iter().chain(&beside);
+        if let Some(name) = repeated(names.filter_map(|entry| entry["name"].as_str())) {
+            bail!("--with: several scenes have the name {}", printable(name));
+        }
+        before.forget(&beside);
         let elsewhere = before.elsewhere();
         let mut summary = format!(
             "{}: {} scenes ({} train, {} test) of {} base scenes, layout {}",
@@ -84,6 +94,10 @@ impl Arguments {
         );
         if ignored > 0 {
             summary += &format!("; other files and links, ignored: {ignored}");
+        }
+        if !beside.is_empty() {
+            summary += &format!("; training scenes of --with: {}", beside.len());
+            entries.extend(beside);
         }
         if !elsewhere.is_empty() {
             summary += &format!(
@@ -103,6 +117,12 @@ impl Arguments {
         message::status(printable(&summary));
         Ok(exit::SUCCESS)
     }
+}
+
+/// The first name that occurs twice.
+fn repeated<'a>(mut names: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+    let mut known = BTreeSet::new();
+    names.find(|name| !known.insert(*name))
 }
 
 /// The manifest that is replaced.
@@ -163,6 +183,13 @@ impl Before {
         Kept {
             split: split.and_then(|split| serde_json::from_value(split).ok()),
             base: base.map(str::to_owned),
+        }
+    }
+
+    /// Drops the entries of files that have new ones.
+    fn forget(&mut self, entries: &[Value]) {
+        for file in entries.iter().filter_map(|entry| entry["file"].as_str()) {
+            self.scenes.remove(&FileId::of(&self.root.join(file)));
         }
     }
 

@@ -201,22 +201,26 @@ impl ChannelLayout {
     /// [`Error::Layout`], naming the presets if `name` is neither, or the line and key of a
     /// mistake.
     pub fn resolve(name: &str) -> Result<Self, Error> {
-        let text = match PRESETS.iter().find(|(preset, _)| *preset == name) {
-            Some((_, text)) => (*text).to_owned(),
-            None if Path::new(name).is_file() => read_text(Path::new(name), MAX_CONFIGURATION)
-                .map_err(|source| FileError::Read {
-                    path: name.into(),
-                    source,
-                })?,
-            None => {
-                let presets: Vec<&str> = PRESETS.iter().map(|(preset, _)| *preset).collect();
-                return Err(mistake(
-                    name,
-                    format!("neither a preset ({}) nor a file", presets.join(", ")),
-                ));
-            }
-        };
+        if let Some(preset) = Self::preset(name) {
+            return Ok(preset);
+        }
+        let path = Path::new(name);
+        if !path.is_file() {
+            let presets = PRESETS.map(|(preset, _)| preset).join(", ");
+            let problem = format!("neither a preset ({presets}) nor a file");
+            return Err(mistake(name, problem));
+        }
+        let text = read_text(path, MAX_CONFIGURATION).map_err(|source| FileError::Read {
+            path: name.into(),
+            source,
+        })?;
         Self::from_toml(name, &text)
+    }
+
+    /// The preset of this name.
+    pub fn preset(name: &str) -> Option<Self> {
+        let (_, text) = PRESETS.iter().find(|(preset, _)| *preset == name)?;
+        Some(Self::from_toml(name, text).expect("presets are valid"))
     }
 
     /// Parses and checks a layout; errors refer to it as `name`.

@@ -152,6 +152,7 @@ impl Images {
     }
 
     fn score(&self, scene: &Scene, layout: &ChannelLayout) -> anyhow::Result<Vec<ImageValue>> {
+        let layout = scene.layout(layout);
         let frame = read_frame(&scene.path, layout)?;
         let image = self.image(scene, &frame, layout)?;
         let score = ImageScore {

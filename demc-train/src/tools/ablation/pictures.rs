@@ -53,7 +53,7 @@ pub(super) fn write(spec: &AblationSpec) -> anyhow::Result<()> {
 }
 
 fn picture(spec: &AblationSpec, scene: &Scene, layout: &ChannelLayout) -> anyhow::Result<Picture> {
-    let frame = read_frame(&scene.path, layout)?;
+    let frame = read_frame(&scene.path, scene.layout(layout))?;
     let (height, width) = (frame.height, frame.width);
     let hdr = |planes: &[f32]| Picture::from_hdr(planes, height, width);
     let mut parts = Vec::new();
@@ -66,7 +66,7 @@ fn picture(spec: &AblationSpec, scene: &Scene, layout: &ChannelLayout) -> anyhow
     for variant in &spec.variants {
         let config = spec.run(variant, spec.seeds[0]);
         let bundle = Bundle::load(config.run_dir(), &Device::flex())?;
-        let frame = read_frame(&scene.path, &bundle.meta.layout)?;
+        let frame = read_frame(&scene.path, scene.layout(&bundle.meta.layout))?;
         if let Some(map) = bundle.detail_map(&frame)? {
             parts.push(Picture::from_detail_map(&map, height, width));
         }
