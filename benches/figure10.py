@@ -10,31 +10,24 @@ repeated until it has the size. Open Image Denoise (OIDN) runs in its own `oidnB
 
 import argparse
 import json
-import re
 import statistics
-import subprocess
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
-import pyoidn
+from oidn import ROOT, peer_seconds, said
 
-ROOT = Path(__file__).resolve().parent.parent
 PROGRAMS = ROOT / "target" / "release"
 HEIGHT, WIDTH = 720, 1280
 NETWORKS = {"DEMC": "demc", "KPCN": "kpcn"}
 """The configurations of `configs/paper`."""
 
 
-def said(*command: object) -> str:
-    return subprocess.run([*map(str, command)], check=True, stdout=subprocess.PIPE, text=True).stdout
-
-
 def seconds(*command: object) -> float:
     start = time.monotonic()
-    said(*command)
+    said([*command])
     return time.monotonic() - start
 
 
@@ -54,15 +47,8 @@ def trained(variant: str, folder: Path) -> Path:
     run = folder / variant
     settings = [f"data.root={folder}", "data.batch_size=1", "data.validation=0", "train.steps=1", "loss.separate=0"]
     sets = [word for setting in settings for word in ("--set", setting)]
-    said(PROGRAMS / "demc-train", "--config", ROOT / f"configs/paper/{variant}.toml", *sets, "--run-dir", run)
+    said([PROGRAMS / "demc-train", "--config", ROOT / f"configs/paper/{variant}.toml", *sets, "--run-dir", run])
     return run
-
-
-def oidn(quality: str) -> float:
-    program = Path(pyoidn.__file__).parent / "oidn/bin/oidnBenchmark"
-    program.chmod(0o755)
-    text = said(program, "-r", rf"RT\.hdr_alb_nrm\.{WIDTH}x{HEIGHT}", "-q", quality, "-n", 3)
-    return float(re.search(r"([\d.]+) msec/image", text)[1]) / 1000
 
 
 def main() -> None:
@@ -82,7 +68,7 @@ def main() -> None:
         models = {name: ["--model", trained(variant, folder)] for name, variant in NETWORKS.items()}
         denoise = PROGRAMS / "demc-infer", "denoise", image, "-o", output, "--overwrite"
         ways = {name: (lambda how=how: seconds(*denoise, *how)) for name, how in (models | {"NFOR": ["--filter", "nfor"]}).items()}
-        ways["OIDN, `high`"] = lambda: oidn("high")
+        ways["OIDN, `high`"] = lambda: peer_seconds("high", "hdr_alb_nrm", (HEIGHT, WIDTH))
         rounds = [{name: way() for name, way in ways.items()} for _ in range(args.rounds)]
     print("| denoiser | s | times DEMC's (least to most) |\n|---|---:|---:|")
     for name in ways:

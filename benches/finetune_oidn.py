@@ -52,8 +52,6 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--public", type=Path, metavar="DIR", help="data set whose test scenes tell what was forgotten")
     parser.add_argument("--renderers", nargs="+", choices=RENDERERS, default=RENDERERS)
-    parser.add_argument("--size", default="224x224", help="size of the views [224x224]")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a key of the configuration")
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
     start = args.output / "unet.safetensors"
@@ -63,14 +61,15 @@ def main() -> None:
     for renderer in args.renderers:
         data, tuned = args.output / renderer, args.output / f"run-{renderer}"
         make = sys.executable, ROOT / "tests/renderers/data_set.py", renderer
-        how = "-o", data, "--ref-spp", 512, "--size", args.size
-        run(*make, TRAIN, *how, "--with", ROOT / "data/sample")
+        how = "-o", data, "--ref-spp", 512
+        run(*make, TRAIN, *how)
         run(*make, TEST, *how, "--split", "test")
-        sets = [word for key in (f"data.root={data}", f"train.init={start}", *args.set) for word in ("--set", key)]
+        run(PROGRAMS / "demc-data", "index", data, "--with", ROOT / "data/sample", "--overwrite")
         if not (tuned / "test.json").exists():
-            run(PROGRAMS / "demc-train", "--config", ROOT / "configs/oidn.toml", *sets, "--run-dir", tuned)
-        sets = [(data, ["oidn", "oidn-prefilter"]), *([(args.public, ["oidn"])] if args.public else [])]
-        for place, baselines in sets:
+            keys = "--set", f"data.root={data}", "--set", f"train.init={start}"
+            run(PROGRAMS / "demc-train", "--config", ROOT / "configs/oidn.toml", *keys, "--run-dir", tuned)
+        places = [(data, ["oidn", "oidn-prefilter"]), *([(args.public, ["oidn"])] if args.public else [])]
+        for place, baselines in places:
             rows.append((renderer, place.name, scores(place, tuned, args.output, baselines)))
     print("| trained on | scored on | by | RelMSE | / OIDN | SSIM | - OIDN | energy bias |\n|---|---|---|---:|---:|---:|---:|---:|")
     for renderer, place, means in rows:

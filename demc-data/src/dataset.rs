@@ -120,9 +120,8 @@ fn once() -> NonZero<u8> {
 }
 
 impl Dataset {
-    /// Opens `root/manifest.json` and checks every scene's file: it exists, has the size in the
-    /// manifest, and holds the channels of its own layout or else of `layout`, including the reference. Decodes
-    /// no pixels.
+    /// Opens `root/manifest.json` and checks every scene's file: it exists, and has the size in the manifest.
+    /// It holds the channels of its own layout, or else of `layout`, including the reference. Decodes no pixels.
     ///
     /// # Errors
     /// [`FileError::Read`] without a manifest, otherwise [`Error::Dataset`] with all problems.

@@ -24,8 +24,8 @@ from safetensors.numpy import save
 from torch import Tensor, nn
 
 from demc.torch import Denoiser, Kpcn, ModelConfig, Unet, hdr_from_gamma, rel_mse
-from demc.torch.kpcn import joined_hdr, separate_loss
 from demc.torch.config import READINGS, UNET, VARIANTS
+from demc.torch.kpcn import joined_hdr, separate_loss
 
 FIXTURES = Path(__file__).parent / "fixtures"
 WIDTH = 2
@@ -125,8 +125,6 @@ def draw_weights(config: ModelConfig, batch: dict[str, Tensor], random: np.rando
 
 def zero_by_construction(config: ModelConfig, name: str) -> bool:
     """Whether this is a bias before a batch normalisation, which cancels the bias with the mean."""
-    if config.variant == UNET:
-        return False
     normed = ("deconv.bias", "latent.conv.bias") if READINGS[config.reading].norm else ()
     return name.endswith(("fusion.blocks.1.conv.bias", "fusion.blocks.2.conv.bias", *normed))
 

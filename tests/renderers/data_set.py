@@ -5,8 +5,7 @@
 Each view becomes one file of the layout `demc-exr`: colour and features of 4 samples per pixel, and a reference with
 other samples, whose own albedo and normal are kept for `tools/references.py`. The second albedo is a copy of the
 first. Existing files are kept, so an interrupted command can be repeated. `docs/renderers.md` reports scenes 1 to 4; this
-script refuses them. `--split test` lists views that training does not see. `--with` also lists the training scenes of
-another data set. `--copies` lists each view several times, so that a few views count more.
+script refuses them. `--split test` lists views that training does not see. `--copies` lists each view several times, so that a few views count more.
 """
 
 from __future__ import annotations
@@ -94,7 +93,6 @@ def main() -> None:
     parser.add_argument("--ref-spp", type=int, default=128)
     parser.add_argument("--split", choices=["train", "test"], default="train")
     parser.add_argument("--copies", type=int, default=1)
-    parser.add_argument("--with", dest="other", type=Path, metavar="DIR")
     options = parser.parse_args()
     first, _, last = options.scenes.partition("-")
     numbers = range(int(first), int(last or first) + 1)
@@ -104,11 +102,6 @@ def main() -> None:
     manifest = options.output / "manifest.json"
     listed = json.loads(manifest.read_text()) if manifest.exists() else {"format": "demc-exr 1", "scenes": []}
     known = {scene["name"] for scene in listed["scenes"]}
-    if options.other:
-        for scene in json.loads((options.other / "manifest.json").read_text())["scenes"]:
-            if scene["split"] == "train" and scene["name"] not in known:
-                file = os.path.relpath((options.other / scene["file"]).resolve(), options.output.resolve())
-                listed["scenes"].append(scene | {"file": file})
     width, height = map(int, options.size.split("x"))
     for number in numbers:
         name = f"{options.renderer}-{number}"

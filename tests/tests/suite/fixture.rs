@@ -79,9 +79,6 @@ pub fn config(variant: Variant, reading: Reading) -> ModelConfig {
 
 /// Name of a fixture file.
 pub fn network_name(config: &ModelConfig) -> String {
-    if config.variant == Variant::Unet {
-        return "unet".into();
-    }
     let end = match config.head {
         Head::Kernel => "-kernel",
         Head::Grey | Head::Xavier => "",

@@ -1,24 +1,24 @@
 //! `demc-data index`.
 
-mod beside;
 mod found;
+mod manifests;
 mod rules;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use clap::Args;
-use demc_program::file::FileId;
 use demc_program::message::{self, printable};
 use demc_program::output::{Directories, Outputs};
 use demc_program::{exit, file};
-use serde_json::{Map, Value, json};
+use serde_json::Value;
 
-use crate::dataset::{FORMAT, MAX_MANIFEST, Split};
+use crate::dataset::Split;
 use found::{exr_files, headers};
-use rules::{Entry, Kept, Rules};
+use manifests::Before;
+use rules::Rules;
 
 #[derive(Args)]
 #[command(
@@ -76,7 +76,7 @@ impl Arguments {
         let count = |split: Split| scenes.iter().filter(|scene| scene.split == split).count();
         let bases: BTreeSet<&str> = scenes.iter().map(|scene| scene.base.as_str()).collect();
         let mut entries: Vec<Value> = scenes.iter().map(|scene| before.entry(scene)).collect();
-        let beside = beside::entries(&self.root, &self.beside, &found[0].layout)?;
+        let beside = manifests::beside(&self.root, &self.beside, &found[0].layout)?;
         let names = entries.iter().chain(&beside);
         if let Some(name) = repeated(names.filter_map(|entry| entry["name"].as_str())) {
             bail!("--with: several scenes have the name {}", printable(name));
@@ -123,105 +123,4 @@ impl Arguments {
 fn repeated<'a>(mut names: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     let mut known = BTreeSet::new();
     names.find(|name| !known.insert(*name))
-}
-
-/// The manifest that is replaced.
-struct Before {
-    root: PathBuf,
-    /// Its keys, with an empty list of scenes.
-    keys: Map<String, Value>,
-    /// Its entries by file, whatever its path.
-    scenes: BTreeMap<FileId, Map<String, Value>>,
-}
-
-impl Default for Before {
-    fn default() -> Self {
-        let mut keys = Map::new();
-        keys.insert("format".to_owned(), FORMAT.into());
-        Self {
-            root: PathBuf::new(),
-            keys,
-            scenes: BTreeMap::new(),
-        }
-    }
-}
-
-impl Before {
-    fn read(root: &Path, path: &Path) -> Result<Self> {
-        let shown = path.display();
-        let text = file::read_regular_text(path, MAX_MANIFEST)
-            .with_context(|| format!("cannot read {shown}"))?;
-        let mut before = Self {
-            root: root.to_owned(),
-            ..Self::default()
-        };
-        let keys: Map<String, Value> =
-            serde_json::from_str(&text).with_context(|| format!("{shown} is not a manifest"))?;
-        before.keys.extend(keys);
-        before.keys.insert("format".to_owned(), FORMAT.into());
-        let scenes = before.keys.insert("scenes".to_owned(), Value::Null);
-        let Some(Value::Array(scenes)) = scenes else {
-            bail!("{shown} is not a manifest: it has no list `scenes`");
-        };
-        for scene in scenes {
-            if let Value::Object(scene) = scene
-                && let Some(Value::String(file)) = scene.get("file")
-            {
-                before.scenes.insert(FileId::of(&root.join(file)), scene);
-            }
-        }
-        Ok(before)
-    }
-
-    /// What a file is in it.
-    fn kept(&self, file: &str) -> Kept {
-        let Some(scene) = self.scenes.get(&FileId::of(&self.root.join(file))) else {
-            return Kept::default();
-        };
-        let split = scene.get("split").cloned();
-        let base = scene.get("base").and_then(Value::as_str);
-        Kept {
-            split: split.and_then(|split| serde_json::from_value(split).ok()),
-            base: base.map(str::to_owned),
-        }
-    }
-
-    /// Drops the entries of files that have new ones.
-    fn forget(&mut self, entries: &[Value]) {
-        for file in entries.iter().filter_map(|entry| entry["file"].as_str()) {
-            self.scenes.remove(&FileId::of(&self.root.join(file)));
-        }
-    }
-
-    /// Takes the entries whose files exist, but were not found in the directory: those of `../other/a.exr`.
-    fn elsewhere(&mut self) -> Vec<Value> {
-        let exists = |scene: &Map<String, Value>| {
-            let file = scene.get("file").and_then(Value::as_str);
-            file.is_some_and(|file| self.root.join(file).exists())
-        };
-        let scenes = std::mem::take(&mut self.scenes);
-        let (kept, gone) = scenes.into_iter().partition(|(_, scene)| exists(scene));
-        self.scenes = gone;
-        let kept: BTreeMap<FileId, Map<String, Value>> = kept;
-        kept.into_values().map(Value::Object).collect()
-    }
-
-    /// The new entry of a scene, with the other keys of its old one.
-    fn entry(&mut self, scene: &Entry) -> Value {
-        let mut entry = json!({
-            "name": scene.name,
-            "split": scene.split,
-            "base": scene.base,
-            "file": scene.file,
-            "width": scene.width,
-            "height": scene.height,
-        });
-        let file = FileId::of(&self.root.join(&scene.file));
-        if let (Some(entry), Some(old)) = (entry.as_object_mut(), self.scenes.remove(&file)) {
-            for (key, value) in old {
-                entry.entry(key).or_insert(value);
-            }
-        }
-        entry
-    }
 }

@@ -160,7 +160,9 @@ fn the_unet_is_pytorchs() {
         let model = network(&config, &fixture, &device).with_ops(ops);
         check_first_step(&model, &batch, config.reading, &fixture);
         let stepped = step_with_adam(model, &batch);
-        for expected in fixture.group("adam/") {
+        let expected = fixture.group("adam/");
+        assert_eq!(stepped.len(), expected.len(), "number of weights");
+        for expected in expected {
             let start = &started[&expected.name];
             let found = &stepped[&expected.name];
             let (mut error, mut path) = (0.0, 0.0);
