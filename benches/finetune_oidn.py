@@ -1,12 +1,13 @@
 """Fine-tunes Open Image Denoise (OIDN) for three renderers with `configs/oidn.toml`, and scores the result.
 
-    pip install bpy mitsuba pyluxcore numpy OpenEXR pyoidn
+    pip install bpy mitsuba pyluxcore numpy OpenEXR pyoidn pillow
     python benches/finetune_oidn.py -o runs/oidn-bar --public data/renders [--renderers cycles]
 
 For each renderer: ten generated views to train on and ten others to score, 4 samples per pixel; the training
 scenes of `data/sample` beside them. The scores are those of the fine-tuned weights, of OIDN with the same
 guides, and of OIDN with denoised guides; then those of both on the test scenes of `--public`, which tell what
-was forgotten. Finished parts are kept, so an interrupted command can be repeated.
+was forgotten. `before-after.png` shows the first test view of each renderer: noisy, OIDN, fine-tuned, reference.
+Finished parts are kept, so an interrupted command can be repeated.
 """
 
 import argparse
@@ -16,7 +17,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import OpenEXR
 import pyoidn
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parent.parent
 PROGRAMS = ROOT / "target" / "release"
@@ -28,6 +32,23 @@ METRICS = ("relmse", "ssim", "energy-bias")
 
 def run(*command: object) -> None:
     subprocess.run([*map(str, command)], check=True)
+
+
+def shown(path: Path, prefix: str = "") -> np.ndarray:
+    """An image in gamma space, `[height, width, 3]` of 8 bits."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = file.channels()
+        linear = np.stack([channels[prefix + name].pixels.astype(np.float32) for name in "RGB"], axis=-1)
+    return (255 * linear.clip(0, 1) ** (1 / 2.2)).round().astype(np.uint8)
+
+
+def before_after(data: Path, model: Path, folder: Path) -> np.ndarray:
+    """The first test view: noisy, OIDN, fine-tuned, reference."""
+    view = min((data / "test").glob("*.exr"))
+    tuned = folder / f"{view.stem}-tuned.exr"
+    run(PROGRAMS / "demc-infer", "denoise", "--model", model, view, "-o", tuned, "--overwrite")
+    oidn = folder / f"{data.name}-oidn" / view.name
+    return np.concatenate([shown(view), shown(oidn), shown(tuned), shown(view, "ref.")], axis=1)
 
 
 def scores(data: Path, model: Path, folder: Path, baselines: list[str]) -> dict[str, dict[str, float]]:
@@ -57,7 +78,7 @@ def main() -> None:
     start = args.output / "unet.safetensors"
     library = next(Path(pyoidn.__file__).parent.rglob("libOpenImageDenoise_core.*"))
     run(PROGRAMS / "demc-infer", "import", "--oidn", library, "-o", start, "--overwrite")
-    rows = []
+    rows, pictures = [], []
     for renderer in args.renderers:
         data, tuned = args.output / renderer, args.output / f"run-{renderer}"
         make = sys.executable, ROOT / "tests/renderers/data_set.py", renderer
@@ -71,6 +92,8 @@ def main() -> None:
         places = [(data, ["oidn", "oidn-prefilter"]), *([(args.public, ["oidn"])] if args.public else [])]
         for place, baselines in places:
             rows.append((renderer, place.name, scores(place, tuned, args.output, baselines)))
+        pictures.append(before_after(data, tuned, args.output))
+    Image.fromarray(np.concatenate(pictures)).save(args.output / "before-after.png", optimize=True)
     print("| trained on | scored on | by | RelMSE | / OIDN | SSIM | - OIDN | energy bias |\n|---|---|---|---:|---:|---:|---:|---:|")
     for renderer, place, means in rows:
         plain = means["oidn"]

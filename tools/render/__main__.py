@@ -29,6 +29,7 @@ from pathlib import Path
 import numpy as np
 import views
 from comparison import ComparisonRoom, ComparisonStill, GlassBalls
+from kinds import KINDS, kind_of
 from reserved import ReservedRoom, ReservedStill
 from rooms import Room
 from stills import Still
@@ -123,6 +124,8 @@ def render(args: argparse.Namespace) -> None:
                 )
                 for (channels, facts), file in zip(images, files.values()):
                     place = {"name": file, "split": args.split, "base": base.name, "file": f"{args.split}/{file}.exr"}
+                    if args.kind:
+                        place["kind"] = args.kind
                     if args.counts:
                         place["repeat"] = max((times for least, times in REPEATS.items() if facts["spp"] >= least), default=1)
                     views.write(folder / f"{file}.exr", channels, place | facts)
@@ -193,6 +196,8 @@ def still_life(args, index: int) -> tuple[Still, np.random.Generator]:
     """A still life, and the random generator for its cameras."""
     rng = np.random.default_rng([args.seed, index, 4])
     _, kind = EDITIONS[args.edition]
+    if args.kind:
+        kind = kind_of(KINDS[args.kind], kind)
     still = kind(rng, args.grain, np.random.default_rng([args.seed, index, 5]))
     lamps = np.random.default_rng([args.seed, index, 6])
     if lamps.random() < args.studio:
@@ -249,6 +254,7 @@ def arguments() -> list[argparse.Namespace]:
     parser.add_argument("--ref-spp", type=int, default=128, metavar="N", help="largest number of samples per pixel of the reference [128]")
     parser.add_argument("--residual", type=float, default=0.03, metavar="X", help="expected RelMSE at which a reference is good enough [0.03]")
     parser.add_argument("--edition", choices=[*EDITIONS], default="train", help="furniture, textures, and lights: of training, of the held-out set, of the paper's comparison, or glass balls; no two share any [train]")
+    parser.add_argument("--kind", choices=[*KINDS], help="still lifes of a kind that is hard to denoise: glass and mirrors, many lamps, plants in the sun, nets and print, or hair")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of rooms, still lifes, and samples [1]")
     parser.add_argument("--split", choices=("train", "test"), default="train", help="split of the rendered views [train]")
     parser.add_argument("--with", dest="beside", action="append", default=[], type=Path, metavar="DIR", help="data set whose scenes are also listed; can be repeated")

@@ -116,14 +116,19 @@ class Stage:
         a = (row * (SEGMENTS + 1) + column).ravel()
         b, c, d = a + 1, a + SEGMENTS + 1, a + SEGMENTS + 2
         faces = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)])
-        properties = mi.Properties()
-        properties["bsdf"] = mi.load_dict(self.any_material())
-        mesh = mi.Mesh("turned", points[..., 0].size, len(faces), has_vertex_texcoords=True, props=properties)
-        parameters = mi.traverse(mesh)
         matrix = np.array(place.matrix, float)
         world = points.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
-        parameters["vertex_positions"] = mi.Float(world.ravel().astype(np.float32))
-        parameters["vertex_texcoords"] = mi.Float(np.stack([u, v], -1).ravel().astype(np.float32))
+        self.mesh(world, faces, self.any_material(), np.stack([u, v], -1).reshape(-1, 2))
+
+    def mesh(self, points: np.ndarray, faces: np.ndarray, bsdf: dict, uv: np.ndarray | None = None) -> None:
+        """Triangles `[N, 3]` between points `[M, 3]`, with texture coordinates `[M, 2]`."""
+        properties = mi.Properties()
+        properties["bsdf"] = mi.load_dict(bsdf)
+        mesh = mi.Mesh("mesh", len(points), len(faces), has_vertex_texcoords=uv is not None, props=properties)
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"] = mi.Float(points.ravel().astype(np.float32))
+        if uv is not None:
+            parameters["vertex_texcoords"] = mi.Float(uv.ravel().astype(np.float32))
         parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
         parameters.update()
         self.scene[f"shape{len(self.scene)}"] = mesh

@@ -17,7 +17,7 @@ MISSING = [name for name in ("numpy", "OpenEXR", "mitsuba") if importlib.util.fi
 SIDE, SAMPLES = 32, 1024
 SHARED = {
     *("Stage.__init__", "Stage.tint", "Stage.paint", "Stage.material", "Stage.any_material", "color", "noise", "tiled"),
-    *("Stage.add", "Stage.box", "Stage.rod", "Stage.ball", "Stage.turned", "environment", "square_film"),
+    *("Stage.add", "Stage.box", "Stage.rod", "Stage.ball", "Stage.turned", "Stage.mesh", "environment", "square_film"),
     *("Room.__init__", "Room.shell", "Room.ceiling", "Room.pictures", "Room.furnish", "Room.blacken", "Room.camera"),
     *("Still.__init__", "Still.ground", "Still.surface", "Still.arrange", "Still.darken", "Still.camera"),
 }
@@ -268,6 +268,37 @@ class Render(unittest.TestCase):
             lit.append(np.median(image.color[~missed].max(-1)) / 16)
         self.assertGreater(behind, SIDE**2 / 4)
         self.assertGreater(np.median(lit), 0.05)
+
+    def test_each_kind_has_what_it_is_named_for(self) -> None:
+        import mitsuba as mi
+        import numpy as np
+        import tracer
+        from comparison import ComparisonStill
+        from kinds import KINDS, kind_of
+        from stills import Still
+
+        words = {"glassware": "'dielectric'", "lights": "'emitter'", "foliage": "Mesh", "fine": "'cylinder'", "fur": "BSplineCurve"}
+        self.assertEqual(set(words), set(KINDS))
+        for kind, word in words.items():
+            for edition in (Still, ComparisonStill):
+                with self.subTest(kind, edition=edition):
+                    found = [0, 0]
+                    for seed in range(3):
+                        stills = [make(np.random.default_rng(seed)) for make in (edition, kind_of(KINDS[kind], edition))]
+                        for i, still in enumerate(stills):
+                            shapes = (str(shape) if isinstance(shape, (dict, str)) else shape.class_name() for shape in still.scene.values())
+                            found[i] += sum(shape.count(word) for shape in shapes)
+                    self.assertGreater(found[1], found[0] + 2)
+                    scene = mi.load_dict(still.scene | {"camera": still.camera(np.random.default_rng(4), SIDE)})
+                    image = tracer.render(scene, 4, 1)
+                    self.assertTrue(np.isfinite(image.color).all() and image.color.max() > 0)
+
+    def test_a_view_of_a_kind_says_so(self) -> None:
+        with tempfile.TemporaryDirectory() as out:
+            ended = run("-o", out, "--stills", 2, "--views", 1, "--size", 32, "--ref-spp", 32, "--kind", "fine")
+            self.assertEqual(ended.returncode, 0, ended.stderr)
+            scenes = json.loads((Path(out) / "manifest.json").read_text())["scenes"]
+            self.assertEqual({scene["kind"] for scene in scenes}, {"fine"})
 
     def test_a_data_set_depends_on_its_seed_and_resumes(self) -> None:
         for kind in ("--rooms", "--stills"):
