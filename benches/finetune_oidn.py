@@ -4,10 +4,11 @@
     python benches/finetune_oidn.py -o runs/oidn-bar --public data/renders [--renderers cycles]
 
 For each renderer: ten generated views to train on and ten others to score, 4 samples per pixel; the training
-scenes of `data/sample` beside them. The scores are those of the fine-tuned weights, of OIDN with the same
-guides, and of OIDN with denoised guides; then those of both on the test scenes of `--public`, which tell what
-was forgotten. `before-after.png` shows the first test view of each renderer: noisy, OIDN, fine-tuned, reference.
-Finished parts are kept, so an interrupted command can be repeated.
+scenes of `data/sample` beside them. Two ways: guides as rendered, and guides denoised first by OIDN, in
+training and test. The scores are those of the fine-tuned weights and of OIDN in both ways, then on the test
+scenes of `--public`, which tell what was forgotten. `before-after.png` shows the first test view of each renderer:
+noisy, OIDN, fine-tuned, fine-tuned with denoised guides, reference. Finished parts are kept, so an interrupted
+command can be repeated.
 """
 
 import argparse
@@ -27,6 +28,9 @@ PROGRAMS = ROOT / "target" / "release"
 RENDERERS = ("cycles", "luxcore", "mitsuba")
 TRAIN, TEST = "501-510", "511-520"
 """Numbers of the scenes. No setting was chosen by them."""
+WAYS = {"as rendered": ("rt_hdr_alb_nrm", ""), "denoised": ("rt_hdr_calb_cnrm", "-clean")}
+"""Guides: OIDN's weights to start from, and the ending of folders."""
+OIDN = ["oidn", "oidn-prefilter"]
 METRICS = ("relmse", "ssim", "energy-bias")
 
 
@@ -42,30 +46,41 @@ def shown(path: Path, prefix: str = "") -> np.ndarray:
     return (255 * linear.clip(0, 1) ** (1 / 2.2)).round().astype(np.uint8)
 
 
-def before_after(data: Path, model: Path, folder: Path) -> np.ndarray:
-    """The first test view: noisy, OIDN, fine-tuned, reference."""
+def before_after(data: Path, folder: Path) -> np.ndarray:
+    """The first test view: noisy, OIDN, fine-tuned in both ways, reference."""
     view = min((data / "test").glob("*.exr"))
-    tuned = folder / f"{view.stem}-tuned.exr"
-    run(PROGRAMS / "demc-infer", "denoise", "--model", model, view, "-o", tuned, "--overwrite")
-    oidn = folder / f"{data.name}-oidn" / view.name
-    return np.concatenate([shown(view), shown(oidn), shown(tuned), shown(view, "ref.")], axis=1)
+    images = [shown(view), shown(folder / f"{data.name}-oidn" / view.name)]
+    for _, ending in WAYS.values():
+        source = folder / f"{data.name}{ending}" / "test" / view.name
+        tuned = folder / f"{view.stem}-tuned{ending}.exr"
+        run(PROGRAMS / "demc-infer", "denoise", "--model", folder / f"run-{data.name}{ending}", source, "-o", tuned, "--overwrite")
+        images.append(shown(tuned))
+    return np.concatenate([*images, shown(view, "ref.")], axis=1)
 
 
-def scores(data: Path, model: Path, folder: Path, baselines: list[str]) -> dict[str, dict[str, float]]:
+def scores(data: Path, ending: str, model: Path, folder: Path) -> dict[str, dict[str, float]]:
     """Means over the test split: of the model (`tuned`), and of OIDN's ways."""
-    made = {name: folder / f"{data.name}-{name}" for name in baselines}
+    made = {name: folder / f"{data.name}-{name}" for name in OIDN}
     for name, images in made.items():
         if not images.exists():
             run(sys.executable, ROOT / "tools/baselines.py", name, "--data", data, "-o", images)
     report = folder / f"{model.name}-{data.name}.json"
     flags = [word for name, images in made.items() for word in ("--baseline", f"{name}={images}")]
-    run(PROGRAMS / "demc-infer", "evaluate", "--model", model, "--data", data, *flags, "--json", report, "--overwrite")
+    seen = guided(data, folder) if ending else data
+    run(PROGRAMS / "demc-infer", "evaluate", "--model", model, "--data", seen, *flags, "--json", report, "--overwrite")
     images = [{"tuned": image["denoised"]} | image["baselines"] for image in json.loads(report.read_text())["images"]]
 
     def mean(name: str, metric: str) -> float:
         return statistics.fmean(abs(image[name][metric]) for image in images)
 
     return {name: {metric: mean(name, metric) for metric in METRICS} for name in images[0]}
+
+
+def guided(data: Path, folder: Path) -> Path:
+    """The copy of a data set with denoised guides; of `--public` the test scenes alone."""
+    copy, flags = folder / f"{data.name}-clean", () if data.parent == folder else ("--split", "test")
+    run(sys.executable, ROOT / "tools/guides.py", "--data", data, "-o", copy, *flags)
+    return copy
 
 
 def main() -> None:
@@ -75,32 +90,36 @@ def main() -> None:
     parser.add_argument("--renderers", nargs="+", choices=RENDERERS, default=RENDERERS)
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
-    start = args.output / "unet.safetensors"
     library = next(Path(pyoidn.__file__).parent.rglob("libOpenImageDenoise_core.*"))
-    run(PROGRAMS / "demc-infer", "import", "--oidn", library, "-o", start, "--overwrite")
+    for weights, _ in WAYS.values():
+        start = args.output / f"{weights}.safetensors"
+        run(PROGRAMS / "demc-infer", "import", "--oidn", library, "--weights", weights, "-o", start, "--overwrite")
     rows, pictures = [], []
     for renderer in args.renderers:
-        data, tuned = args.output / renderer, args.output / f"run-{renderer}"
+        data = args.output / renderer
         make = sys.executable, ROOT / "tests/renderers/data_set.py", renderer
         how = "-o", data, "--ref-spp", 512
         run(*make, TRAIN, *how)
         run(*make, TEST, *how, "--split", "test")
         run(PROGRAMS / "demc-data", "index", data, "--with", ROOT / "data/sample", "--overwrite")
-        if not (tuned / "test.json").exists():
-            keys = "--set", f"data.root={data}", "--set", f"train.init={start}"
-            run(PROGRAMS / "demc-train", "--config", ROOT / "configs/oidn.toml", *keys, "--run-dir", tuned)
-        places = [(data, ["oidn", "oidn-prefilter"]), *([(args.public, ["oidn"])] if args.public else [])]
-        for place, baselines in places:
-            rows.append((renderer, place.name, scores(place, tuned, args.output, baselines)))
-        pictures.append(before_after(data, tuned, args.output))
+        for way, (weights, ending) in WAYS.items():
+            tuned = args.output / f"run-{renderer}{ending}"
+            if not (tuned / "test.json").exists():
+                own = guided(data, args.output) if ending else data
+                keys = "--set", f"data.root={own}", "--set", f"train.init={args.output / weights}.safetensors"
+                run(PROGRAMS / "demc-train", "--config", ROOT / "configs/oidn.toml", *keys, "--run-dir", tuned)
+            for place in (data, *([args.public] if args.public else [])):
+                rows.append((renderer, place.name, way, scores(place, ending, tuned, args.output)))
+        pictures.append(before_after(data, args.output))
     Image.fromarray(np.concatenate(pictures)).save(args.output / "before-after.png", optimize=True)
-    print("| trained on | scored on | by | RelMSE | / OIDN | SSIM | - OIDN | energy bias |\n|---|---|---|---:|---:|---:|---:|---:|")
-    for renderer, place, means in rows:
-        plain = means["oidn"]
-        for name, mean in means.items():
-            cells = [renderer, place, name, f"{mean['relmse']:.4f}", f"{mean['relmse'] / plain['relmse']:.2f}"]
-            cells += [f"{mean['ssim']:.4f}", f"{mean['ssim'] - plain['ssim']:+.4f}", f"{100 * mean['energy-bias']:.2f} %"]
-            print(f"| {' | '.join(cells)} |")
+    print("| trained on | scored on | guides | RelMSE | / OIDN | SSIM | - OIDN | energy bias | OIDN, guides denoised |\n|---|---|---|---:|---:|---:|---:|---:|---:|")
+    for renderer, place, way, means in rows:
+        tuned, plain = means["tuned"], means["oidn"]
+        cells = [renderer, place, way, f"{tuned['relmse']:.4f}", f"{tuned['relmse'] / plain['relmse']:.2f}"]
+        cells += [f"{tuned['ssim']:.4f}", f"{tuned['ssim'] - plain['ssim']:+.4f}", f"{100 * tuned['energy-bias']:.2f} %"]
+        best = means["oidn-prefilter"]
+        cells.append(f"{best['relmse'] / plain['relmse']:.2f}, {best['ssim'] - plain['ssim']:+.4f}, {100 * best['energy-bias']:.2f} %")
+        print(f"| {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":
