@@ -76,6 +76,12 @@ def scores(data: Path, ending: str, model: Path, folder: Path) -> dict[str, dict
     return {name: {metric: mean(name, metric) for metric in METRICS} for name in images[0]}
 
 
+def cells(mean: dict[str, float], plain: dict[str, float]) -> str:
+    """Scores beside those of OIDN with guides as rendered."""
+    ratio, gain = mean["relmse"] / plain["relmse"], mean["ssim"] - plain["ssim"]
+    return f"{ratio:.2f} | {gain:+.4f} | {100 * mean['energy-bias']:.2f} %"
+
+
 def guided(data: Path, folder: Path) -> Path:
     """The copy of a data set with denoised guides; of `--public` the test scenes alone."""
     copy, flags = folder / f"{data.name}-clean", () if data.parent == folder else ("--split", "test")
@@ -108,18 +114,16 @@ def main() -> None:
                 own = guided(data, args.output) if ending else data
                 keys = "--set", f"data.root={own}", "--set", f"train.init={args.output / weights}.safetensors"
                 run(PROGRAMS / "demc-train", "--config", ROOT / "configs/oidn.toml", *keys, "--run-dir", tuned)
-            for place in (data, *([args.public] if args.public else [])):
-                rows.append((renderer, place.name, way, scores(place, ending, tuned, args.output)))
+            places = data, *([args.public] if args.public else [])
+            means = [scores(place, ending, tuned, args.output) for place in places]
+            rows.append([f"{renderer}, guides {way}", *(cells(mean["tuned"], mean["oidn"]) for mean in means)])
+        rows.append([f"{renderer}, OIDN with denoised guides", *(cells(mean["oidn-prefilter"], mean["oidn"]) for mean in means)])
         pictures.append(before_after(data, args.output))
     Image.fromarray(np.concatenate(pictures)).save(args.output / "before-after.png", optimize=True)
-    print("| trained on | scored on | guides | RelMSE | / OIDN | SSIM | - OIDN | energy bias | OIDN, guides denoised |\n|---|---|---|---:|---:|---:|---:|---:|---:|")
-    for renderer, place, way, means in rows:
-        tuned, plain = means["tuned"], means["oidn"]
-        cells = [renderer, place, way, f"{tuned['relmse']:.4f}", f"{tuned['relmse'] / plain['relmse']:.2f}"]
-        cells += [f"{tuned['ssim']:.4f}", f"{tuned['ssim'] - plain['ssim']:+.4f}", f"{100 * tuned['energy-bias']:.2f} %"]
-        best = means["oidn-prefilter"]
-        cells.append(f"{best['relmse'] / plain['relmse']:.2f}, {best['ssim'] - plain['ssim']:+.4f}, {100 * best['energy-bias']:.2f} %")
-        print(f"| {' | '.join(cells)} |")
+    print("| weights of | unseen views: RelMSE / OIDN | SSIM - OIDN | energy bias | test scenes: RelMSE / OIDN | SSIM - OIDN | energy bias |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
+    for row in rows:
+        print(f"| {' | '.join(row)} |")
 
 
 if __name__ == "__main__":
