@@ -6,9 +6,8 @@
 For each renderer: ten generated views to train on and ten others to score, 4 samples per pixel; the training
 scenes of `data/sample` beside them. The scores are those of the fine-tuned weights, and of OIDN with denoised
 guides; both beside those of OIDN with the guides as rendered. The test scenes of `--public` tell what was
-forgotten. `before-after.png` shows a test view of each renderer (the first, the second, the third): noisy, OIDN, fine-tuned,
-reference.
-Finished parts are kept, so an interrupted command can be repeated.
+forgotten. `before-after.png` shows a test view of each renderer: noisy, OIDN, fine-tuned, reference. Finished parts
+are kept, so an interrupted command can be repeated.
 """
 
 import argparse
