@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pyoidn
+from oidn import ROOT
 from PIL import Image
 
-ROOT = Path(__file__).resolve().parent.parent
 PROGRAMS = ROOT / "target" / "release"
 RENDERERS = ("cycles", "luxcore", "mitsuba")
 TRAIN, TEST = "501-510", "511-520"

@@ -8,8 +8,8 @@
 Both denoise an image in memory with as many threads as there are processors. Each round measures each
 program in a process of its own, in turn: OIDN with its own `oidnBenchmark` (HDR colour, albedo, and
 normal), its passes over albedo and normal alone, the models with `demc.denoise`, including albedo filter
-and restored light. A process denoises once without a clock, and then three times, at 3840x2160 once. The table has medians,
-and the median and quartiles of the ratios of each round.
+and restored light. A process denoises once without a clock, and then three times, at 3840x2160 once. The
+table has medians, and the median and quartiles of the ratios of each round.
 
 Memory is the growth of a process's peak from the point where it has the images, once per program: for OIDN
 with `pyoidn.denoise`, which has the output as `demc.denoise` does. It needs Linux.
@@ -30,8 +30,6 @@ import pyoidn
 ROOT = Path(__file__).resolve().parent.parent
 SAMPLE = ROOT / "data/sample/test/col-classroom-1.exr"
 FULL_HD, UHD = (1080, 1920), (2160, 3840)
-PASSES = {FULL_HD: 3, UHD: 1}
-"""Measured images of a process."""
 PAIRS = {"quality": "high", "fast": "fast"}
 """Bundled models, and the quality of OIDN that each is compared with."""
 
@@ -102,6 +100,11 @@ print(seconds)
 """
 
 
+def passes(size: tuple[int, int]) -> int:
+    """Measured images of a process."""
+    return 1 if size == UHD else 3
+
+
 def run(code: str, *arguments: object) -> list[float]:
     """The numbers that a process with this code prints."""
     command = [sys.executable, "-W", "ignore", "-c", code, *arguments]
@@ -114,7 +117,7 @@ def said(command: list[object]) -> str:
 
 def ours(model: object, size: tuple[int, int]) -> list[float]:
     """Seconds and MiB."""
-    return run(DENOISE, SAMPLE, *size, model, PASSES[size])
+    return run(DENOISE, SAMPLE, *size, model, passes(size))
 
 
 def peer_memory(quality: str, images: str, size: tuple[int, int]) -> float:
@@ -125,13 +128,13 @@ def peer_seconds(quality: str, images: str, size: tuple[int, int]) -> float:
     program = Path(pyoidn.__file__).parent / "oidn/bin/oidnBenchmark"
     program.chmod(0o755)
     height, width = size
-    command = [program, "-r", f"RT\\.{images}\\.{width}x{height}", "-q", quality, "-n", PASSES[size]]
+    command = [program, "-r", f"RT\\.{images}\\.{width}x{height}", "-q", quality, "-n", passes(size)]
     return float(re.search(r"([\d.]+) msec/image", said(command))[1]) / 1000
 
 
 def guided_seconds(quality: str, size: tuple[int, int]) -> float:
     """OIDN with albedo and normal denoised first, for which it has networks of its own."""
-    return run(GUIDES, ROOT / "tools", quality, *size, PASSES[size])[0] + peer_seconds(quality, "hdr_calb_cnrm", size)
+    return run(GUIDES, ROOT / "tools", quality, *size, passes(size))[0] + peer_seconds(quality, "hdr_calb_cnrm", size)
 
 
 def compared(mine: list[float], peer: list[float]) -> list[str]:

@@ -12,19 +12,16 @@ time.
 import math
 import os
 import sys
-from glob import glob
 
-if newest := sorted(glob("/usr/lib/*/libLLVM.so.[0-9]*"), key=lambda path: float(path.rpartition(".so.")[2])):
-    os.environ.setdefault("DRJIT_LIBLLVM_PATH", newest[-1])
+import numpy as np
 
-import mitsuba as mi  # noqa: E402
-import numpy as np  # noqa: E402
-
-sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+FOLDER = os.path.dirname(os.path.abspath(__file__))
+sys.path[:0] = [FOLDER, os.path.join(FOLDER, "../../tools/render")]
 import scenes  # noqa: E402
+from variant import mi  # noqa: E402
 
-mi.set_variant("llvm_ad_rgb" if "DRJIT_LIBLLVM_PATH" in os.environ else "scalar_rgb")
-mi.set_log_level(mi.LogLevel.Error)
+if "DRJIT_LIBLLVM_PATH" not in os.environ:
+    mi.set_variant("scalar_rgb")
 
 SAMPLES_AT_ONCE = 32
 """Samples per pixel of a pass; all paths of a pass are in memory."""
