@@ -27,6 +27,7 @@ mod operands;
 pub mod pool;
 pub mod power;
 mod product;
+pub mod pu;
 pub mod reduce;
 pub mod reference;
 pub mod rel_mse;

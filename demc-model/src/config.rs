@@ -1,5 +1,4 @@
-//! The `[model]` table, the variants (Sec. 3, 4.3, 4.4), the readings of the paper, and networks of
-//! others.
+//! The `[model]` table, the variants, and the readings of the paper.
 //!
 //! All differences between networks are in [`VariantSpec`] and [`ReadingSpec`]. The modules read
 //! these tables and do not branch on names. A new variant is a new row.
@@ -8,9 +7,12 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::unet_size::{Guides, UNET_LEVELS, UnetSize};
+use crate::unet_size::{Guides, UnetSize};
 
 mod validate;
+mod variant;
+
+pub use variant::{Input, Variant, VariantSpec, channels_of};
 
 /// Levels of an encoder and of the decoder (Sec. 3.2: "five down-sampling units").
 pub const LEVELS: usize = 5;
@@ -40,25 +42,6 @@ pub const MAX_WIDTH: usize = 256;
 /// Largest number of channels of a level as a multiple of the base width, for the same reason.
 pub const MAX_LEVEL: usize = 16;
 
-/// The network's topology.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Variant {
-    /// The dual-encoder network (Fig. 3).
-    Demc,
-    /// DEMC without the fusion sub-network: the features are the input of their encoder (Sec. 4.3).
-    DemcNosn,
-    /// The single-encoder network (Fig. 4, Sec. 4.4).
-    Semc,
-    /// SEMC without features: one encoder for the noisy colour. Ours: a control that measures what
-    /// the features contribute.
-    ColorOnly,
-    /// The kernel-predicting networks that the paper compares with ([`crate::kpcn`]).
-    Kpcn,
-    /// The U-Net of Open Image Denoise ([`crate::unet`]).
-    Unet,
-}
-
 /// The reading of the paper where its text and the authors' released model differ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -87,6 +70,8 @@ pub enum Head {
     /// Kernels: the network predicts the weights with which noisy pixels are averaged, on four
     /// scales (Bako et al. 2017, Vogels et al. 2018). See [`crate::kernel_head`].
     Kernel,
+    /// A U-Net's image, blended with that of predicted kernels. See [`crate::mixed_head`].
+    Mixed,
 }
 
 impl Head {
@@ -96,12 +81,14 @@ impl Head {
             Head::Grey => "grey",
             Head::Xavier => "xavier",
             Head::Kernel => "kernel",
+            Head::Mixed => "mixed",
         }
     }
 
     /// Whether two heads have the same weights; they may differ in the initialisation.
     pub fn has_weights_of(self, other: Head) -> bool {
-        (self == Head::Kernel) == (other == Head::Kernel)
+        let is_plain = |head| matches!(head, Head::Grey | Head::Xavier);
+        self == other || is_plain(self) && is_plain(other)
     }
 }
 
@@ -120,76 +107,6 @@ pub enum Detail {
     Xavier,
 }
 
-/// One of the images that an encoder takes as input.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Input {
-    /// Gamma-compressed noisy colour, 3 channels.
-    Color,
-    /// The fused detail map, 3 channels.
-    DetailMap,
-    /// The Z-scored features, 12 channels.
-    Features,
-}
-
-impl Input {
-    /// Number of channels.
-    pub fn channels(self) -> usize {
-        match self {
-            Input::Color => COLOR_CHANNELS,
-            Input::DetailMap => DETAIL_CHANNELS,
-            Input::Features => FEATURE_CHANNELS,
-        }
-    }
-}
-
-/// Channels of the concatenation of `inputs`.
-pub fn channels_of(inputs: &[Input]) -> usize {
-    inputs.iter().map(|input| input.channels()).sum()
-}
-
-/// A row of the table of variants.
-#[derive(Debug)]
-pub struct VariantSpec {
-    /// Name in configuration files.
-    pub name: &'static str,
-    /// The inputs of each encoder, concatenated over channels in this order. The skips enter the
-    /// fusion in the order of the encoders (Eq. 2: features, then HDR). The last encoder feeds the
-    /// latent. None: the variant has another body.
-    pub encoders: &'static [&'static [Input]],
-    /// Channels of the colour at input and output: one image, or two for KPCN.
-    pub color_channels: usize,
-    /// Times that the network halves the resolution: the sides of its input are multiples of 2 to this
-    /// power. The convolutions of KPCN could take any size.
-    pub halvings: usize,
-    /// Whether an image of another size gets zeros at its right and bottom, as in OIDN; otherwise its
-    /// last pixels are repeated.
-    pub pads_with_zeros: bool,
-}
-
-/// What most rows share: the paper's values.
-const PAPER: VariantSpec = VariantSpec {
-    name: "",
-    encoders: &[],
-    color_channels: COLOR_CHANNELS,
-    halvings: LEVELS,
-    pads_with_zeros: false,
-};
-
-impl VariantSpec {
-    /// Whether the variant has the fusion sub-network: whether an encoder takes the detail map as
-    /// input.
-    pub fn has_fusion(&self) -> bool {
-        self.encoders
-            .iter()
-            .any(|inputs| inputs.contains(&Input::DetailMap))
-    }
-
-    /// Whether the features have any effect: false if encoders take the colour alone as input.
-    pub fn takes_features(&self) -> bool {
-        self.encoders != [[Input::Color]]
-    }
-}
-
 /// A row of the table of readings.
 #[derive(Debug)]
 pub struct ReadingSpec {
@@ -205,62 +122,6 @@ pub struct ReadingSpec {
     pub activated_fusion: bool,
     /// Side of the output convolution's kernel (Fig. 3: 1), unless the head is [`Head::Kernel`].
     pub head_kernel: usize,
-}
-
-impl Variant {
-    /// All variants: those of the paper in its order, the control, KPCN, and the U-Net.
-    pub const ALL: [Variant; 6] = [
-        Variant::Demc,
-        Variant::DemcNosn,
-        Variant::Semc,
-        Variant::ColorOnly,
-        Variant::Kpcn,
-        Variant::Unet,
-    ];
-
-    /// The variants that are a [`crate::dual_encoder::DualEncoder`].
-    pub fn with_encoders() -> impl Iterator<Item = Variant> {
-        Self::ALL
-            .into_iter()
-            .filter(|variant| !variant.spec().encoders.is_empty())
-    }
-
-    /// The table of variants.
-    pub fn spec(self) -> &'static VariantSpec {
-        match self {
-            Variant::Demc => &VariantSpec {
-                name: "demc",
-                encoders: &[&[Input::DetailMap], &[Input::Color]],
-                ..PAPER
-            },
-            Variant::DemcNosn => &VariantSpec {
-                name: "demc-nosn",
-                encoders: &[&[Input::Features], &[Input::Color]],
-                ..PAPER
-            },
-            Variant::Semc => &VariantSpec {
-                name: "semc",
-                encoders: &[&[Input::DetailMap, Input::Color]],
-                ..PAPER
-            },
-            Variant::ColorOnly => &VariantSpec {
-                name: "color-only",
-                encoders: &[&[Input::Color]],
-                ..PAPER
-            },
-            Variant::Kpcn => &VariantSpec {
-                name: "kpcn",
-                color_channels: 2 * COLOR_CHANNELS,
-                ..PAPER
-            },
-            Variant::Unet => &VariantSpec {
-                name: "unet",
-                halvings: UNET_LEVELS,
-                pads_with_zeros: true,
-                ..PAPER
-            },
-        }
-    }
 }
 
 impl Reading {
@@ -339,9 +200,13 @@ impl fmt::Display for ModelConfig {
         let (variant, reading) = (self.variant.spec().name, self.reading.spec().name);
         match self.variant {
             Variant::Kpcn => return write!(f, "{variant}, width {}", self.width),
-            Variant::Unet => {
+            _ if self.variant.is_unet() => {
                 let [size, guides] = [self.size.spec().name, self.guides.name()];
-                return write!(f, "{variant}, {size}, guides {guides}");
+                write!(f, "{variant}, {size}, guides {guides}")?;
+                return match self.variant.spec().side {
+                    Some(_) => write!(f, ", width {}", self.width),
+                    None => Ok(()),
+                };
             }
             _ => (),
         }
@@ -354,6 +219,16 @@ impl fmt::Display for ModelConfig {
 }
 
 impl ModelConfig {
+    /// The U-Net that this one contains: without mixed head and second encoder. `None` for other variants.
+    pub fn trunk(&self) -> Option<ModelConfig> {
+        self.variant.is_unet().then(|| ModelConfig {
+            variant: Variant::Unet,
+            size: self.size,
+            guides: self.guides,
+            ..ModelConfig::default()
+        })
+    }
+
     /// Whether one of the 12 feature channels has any effect.
     pub fn takes_feature(&self, channel: usize) -> bool {
         match self.variant {

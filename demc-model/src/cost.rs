@@ -84,7 +84,7 @@ fn share_of_pixels(level: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{LEVELS, Reading, Variant};
+    use crate::config::{Head, LEVELS, Reading, Variant};
     use crate::kernel_head::KERNEL_LEVELS;
     use crate::unet::{Guides, UNET_LEVELS, UnetSize};
     use burn::tensor::Device;
@@ -164,12 +164,15 @@ mod tests {
 
     fn every_network(check: impl Fn(ModelConfig)) {
         for (size, guides) in UnetSize::ALL.into_iter().zip(Guides::ALL) {
-            check(ModelConfig {
-                variant: Variant::Unet,
-                size,
-                guides,
-                ..ModelConfig::default()
-            });
+            for head in [Head::Grey, Head::Mixed] {
+                check(ModelConfig {
+                    variant: Variant::Unet,
+                    size,
+                    guides,
+                    head,
+                    ..ModelConfig::default()
+                });
+            }
         }
         for variant in Variant::ALL {
             for reading in Reading::ALL {
@@ -207,7 +210,14 @@ mod tests {
         let parts: Vec<&str> = name.split('.').collect();
         let number = |part: &str| part.parse::<usize>().expect("an index");
         match parts[..] {
-            ["fusion", ..] => Stage::Fusion,
+            ["fusion", ..] | ["side", "fusion", ..] => Stage::Fusion,
+            ["side", "levels", level, ..] => Stage::Encoder {
+                encoder: 1,
+                level: number(level),
+            },
+            ["side", "fuses", index, ..] => Stage::Decoder {
+                level: UNET_LEVELS - 1 - number(index),
+            },
             ["encoders", encoder, "levels", level, ..] => Stage::Encoder {
                 encoder: number(encoder),
                 level: number(level),
@@ -234,7 +244,8 @@ mod tests {
                 level: 0,
             },
             ["decoder", "head", ..] => Stage::Head { level: 0 },
-            ["decoder", "kernels", index, ..] => Stage::Head {
+            ["mixed", "gate", _] => Stage::Head { level: 0 },
+            ["decoder" | "mixed", "kernels", index, ..] => Stage::Head {
                 level: KERNEL_LEVELS - 1 - number(index),
             },
             _ => panic!("{name}"),

@@ -90,7 +90,7 @@ impl Denoiser {
     ) -> Result<Self, WeightsError> {
         let body = match config.variant {
             Variant::Kpcn => Body::Kpcn(Kpcn::build(b, config.width)?),
-            Variant::Unet => Body::Unet(Unet::build(b, config.size, config.guides)?),
+            variant if variant.is_unet() => Body::Unet(Unet::build(b, config)?),
             _ => Body::DualEncoder(DualEncoder::build(b, config, head_bias)?),
         };
         Ok(Denoiser {

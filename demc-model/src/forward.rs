@@ -76,7 +76,9 @@ impl Denoiser {
                 Ok(network.forward([color, features], layers, self.ops()))
             }
             Body::Kpcn(networks) => Ok((networks.forward(color, features, self.ops()), None)),
-            Body::Unet(network) if self.infers_on(&network.device(), &color.device()) => {
+            Body::Unet(network)
+                if network.side.is_none() && self.infers_on(&network.device(), &color.device()) =>
+            {
                 let out = inference::forward_unet(network, color, features, observer)?;
                 Ok((out, None))
             }
@@ -103,7 +105,8 @@ impl Denoiser {
     pub fn detail_map(&self, features_z: Tensor<4>) -> Option<Tensor<4>> {
         match &self.body {
             Body::DualEncoder(network) => network.detail_map(features_z, self.ops()),
-            Body::Kpcn(_) | Body::Unet(_) => None,
+            Body::Unet(network) => network.detail_map(features_z, self.ops()),
+            Body::Kpcn(_) => None,
         }
     }
 

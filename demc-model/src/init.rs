@@ -26,6 +26,10 @@ pub enum Init {
     Bilinear,
     /// `[I I I]` (Eq. 3): the skip fusion starts as the sum of its inputs.
     IdentitySum,
+    /// The same value everywhere: the bias of a gate.
+    Filled(f32),
+    /// `[I 0]`: a fusion that starts as its first input.
+    IdentityFirst,
     /// Three given values: the bias of a grey head or of an open detail map.
     Color([f32; 3]),
 }
@@ -46,7 +50,9 @@ impl Init {
             Init::Ones => vec![1.0; len],
             Init::Xavier(scale) => xavier(shape, scale, rng),
             Init::Bilinear => bilinear(shape),
-            Init::IdentitySum => identity_sum(shape),
+            Init::IdentitySum => identity_blocks(shape, usize::MAX),
+            Init::IdentityFirst => identity_blocks(shape, 1),
+            Init::Filled(value) => vec![value; len],
             Init::Color(values) => {
                 assert_eq!(shape, [3], "a colour has three channels");
                 values.to_vec()
@@ -81,18 +87,14 @@ fn bilinear(shape: &[usize]) -> Vec<f32> {
     weight
 }
 
-/// `[I I ... I]`: `in / out` identity blocks side by side (Eq. 3).
-fn identity_sum(shape: &[usize]) -> Vec<f32> {
+/// `[I I ... I]`: identity blocks side by side (Eq. 3), at most `blocks`; zero elsewhere.
+fn identity_blocks(shape: &[usize], blocks: usize) -> Vec<f32> {
     let [out, input, height, width] = four(shape);
     assert_eq!([height, width], [1, 1], "a skip fusion is 1x1");
-    assert_eq!(
-        input % out,
-        0,
-        "a skip fusion has a multiple of its outputs as inputs"
-    );
+    let blocks = blocks.min(input / out);
     let mut weight = vec![0.0; out * input];
     for row in 0..out {
-        for block in 0..input / out {
+        for block in 0..blocks {
             weight[row * input + block * out + row] = 1.0;
         }
     }

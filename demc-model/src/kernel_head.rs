@@ -15,7 +15,6 @@
 
 use burn::nn::conv::Conv2d;
 
-use crate::config::LEVELS;
 use crate::layers::conv1x1;
 use crate::ops::Maps;
 use crate::weights::{Builder, Stage, WeightsError};
@@ -38,10 +37,9 @@ pub fn logits(level: usize) -> usize {
 }
 
 /// The convolutions, deepest level first. They start with nearly equal weights of all pixels.
-pub(crate) fn build(
-    b: &mut Builder,
-    channels: &[usize; LEVELS],
-) -> Result<Vec<Conv2d>, WeightsError> {
+///
+/// `channels`: those of the decoder's levels, from the full resolution down.
+pub(crate) fn build(b: &mut Builder, channels: &[usize]) -> Result<Vec<Conv2d>, WeightsError> {
     b.list("kernels", KERNEL_LEVELS, |b, k| {
         let level = KERNEL_LEVELS - 1 - k;
         b.enter(Stage::Head { level });
@@ -66,11 +64,28 @@ pub(crate) fn forward(
         None => images,
         Some(layers) => Maps::cat_images(vec![images, layers]),
     };
+    let out = filtered(kernels, decoded, images);
+    let (color, layers) = if has_layers {
+        let (color, layers) = out.split_first();
+        (color, Some(layers))
+    } else {
+        (out, None)
+    };
+    (color.gamma(GAMMA, DARKEST), layers)
+}
+
+/// Images in linear light, filtered on all scales.
+///
+/// # Shapes
+/// `decoded`: the decoder's maps, deepest first, of which the last [`KERNEL_LEVELS`] count. Images
+/// `[B, 3, H, W]` to the same.
+pub(crate) fn filtered(kernels: &[Conv2d], decoded: Vec<Maps>, images: Maps) -> Maps {
     let mut scales = vec![images];
     for _ in 1..KERNEL_LEVELS {
         scales.push(scales[scales.len() - 1].clone().halve());
     }
-    let decoded = decoded.into_iter().skip(LEVELS - KERNEL_LEVELS);
+    let above = decoded.len() - KERNEL_LEVELS;
+    let decoded = decoded.into_iter().skip(above);
     let mut out: Option<Maps> = None;
     for ((conv, decoded), image) in kernels.iter().zip(decoded).zip(scales.into_iter().rev()) {
         let filtered = image.filter(decoded.conv1x1(conv));
@@ -79,12 +94,5 @@ pub(crate) fn forward(
             Some(coarse) => filtered.blend(coarse),
         });
     }
-    let out = out.expect("a kernel head has levels");
-    let (color, layers) = if has_layers {
-        let (color, layers) = out.split_first();
-        (color, Some(layers))
-    } else {
-        (out, None)
-    };
-    (color.gamma(GAMMA, DARKEST), layers)
+    out.expect("a kernel head has levels")
 }

@@ -57,6 +57,41 @@ impl ConvBlock {
     }
 }
 
+/// Convolutions with ReLU, one after the other.
+#[derive(Module, Debug)]
+pub struct ConvStack {
+    /// The convolutions, with bias.
+    pub convs: Vec<Conv2d>,
+}
+
+impl ConvStack {
+    pub(crate) fn build(
+        b: &mut Builder,
+        inputs: usize,
+        outputs: &[usize],
+    ) -> Result<Self, WeightsError> {
+        let mut channels = inputs;
+        let convs = b.list("convs", outputs.len(), |b, index| {
+            let built = conv3x3(
+                b,
+                [channels, outputs[index]],
+                Init::Xavier(1.0),
+                Init::Zeros,
+            );
+            channels = outputs[index];
+            built
+        })?;
+        Ok(ConvStack { convs })
+    }
+
+    /// All convolutions.
+    pub fn forward(&self, x: Maps) -> Maps {
+        self.convs
+            .iter()
+            .fold(x, |x, conv| x.conv3x3(conv, Activation::Relu))
+    }
+}
+
 pub(crate) fn conv3x3(
     b: &mut Builder,
     channels: [usize; 2],

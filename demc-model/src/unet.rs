@@ -10,10 +10,12 @@ use burn::module::Module;
 use burn::nn::conv::Conv2d;
 use burn::tensor::{Device, Tensor};
 
-use crate::config::COLOR_CHANNELS;
+use crate::config::{COLOR_CHANNELS, Head, ModelConfig};
 use crate::init::Init;
-use crate::layers::conv3x3;
+use crate::layers::{ConvStack, conv3x3};
+use crate::mixed_head::MixedHead;
 use crate::ops::{Activation, Maps, Ops};
+use crate::side_encoder::SideEncoder;
 pub use crate::unet_size::{Guides, UNET_LEVELS, UnetSize, UnetSpec};
 use crate::weights::{Builder, Stage, WeightsError};
 
@@ -21,50 +23,43 @@ use crate::weights::{Builder, Stage, WeightsError};
 #[derive(Module, Debug)]
 pub struct Unet {
     /// Convolutions of each level, from the full resolution down.
-    pub encoder: Vec<UnetLevel>,
+    pub encoder: Vec<ConvStack>,
     /// Convolutions at a sixteenth of the resolution.
-    pub bottom: UnetLevel,
+    pub bottom: ConvStack,
     /// Convolutions of each level, from the deepest up.
-    pub decoder: Vec<UnetLevel>,
+    pub decoder: Vec<ConvStack>,
     /// The convolution to colour.
     pub head: Conv2d,
+    /// What a mixed head has beside that.
+    pub mixed: Option<MixedHead>,
+    /// The encoder of the features, if the variant has one.
+    pub side: Option<SideEncoder>,
     #[module(skip)]
     guides: Guides,
 }
 
-/// Convolutions with ReLU, one after the other.
-#[derive(Module, Debug)]
-pub struct UnetLevel {
-    /// The convolutions, with bias.
-    pub convs: Vec<Conv2d>,
-}
-
 impl Unet {
-    pub(crate) fn build(
-        b: &mut Builder,
-        size: UnetSize,
-        guides: Guides,
-    ) -> Result<Self, WeightsError> {
-        let spec = size.spec();
-        let mut channels = guides.channels();
+    pub(crate) fn build(b: &mut Builder, config: &ModelConfig) -> Result<Self, WeightsError> {
+        let spec = config.size.spec();
+        let mut channels = config.guides.channels();
         // Channels of the map that each decoder level appends.
         let mut skips = vec![channels];
         let encoder = b.list("encoder", UNET_LEVELS, |b, level| {
             b.enter(Stage::Encoder { encoder: 0, level });
             let outputs = spec.encoder[level];
-            let built = UnetLevel::build(b, channels, outputs)?;
+            let built = ConvStack::build(b, channels, outputs)?;
             channels = outputs[outputs.len() - 1];
             skips.push(channels);
             Ok(built)
         })?;
         b.enter(Stage::Latent);
-        let bottom = b.part("bottom", |b| UnetLevel::build(b, channels, &spec.bottom))?;
+        let bottom = b.part("bottom", |b| ConvStack::build(b, channels, &spec.bottom))?;
         channels = spec.bottom[1];
         let decoder = b.list("decoder", UNET_LEVELS, |b, index| {
             let level = UNET_LEVELS - 1 - index;
             b.enter(Stage::Decoder { level });
             let outputs = &spec.decoder[index];
-            let built = UnetLevel::build(b, channels + skips[level], outputs)?;
+            let built = ConvStack::build(b, channels + skips[level], outputs)?;
             channels = outputs[1];
             Ok(built)
         })?;
@@ -77,12 +72,27 @@ impl Unet {
                 Init::Zeros,
             )
         })?;
+        let mut decoded = spec.decoder.map(|outputs| outputs[1]);
+        decoded.reverse();
+        let mixed = (config.head == Head::Mixed)
+            .then(|| b.part("mixed", |b| MixedHead::build(b, &decoded)))
+            .transpose()?;
+        let input = config.variant.spec().side;
+        let side = input
+            .map(|input| {
+                b.part("side", |b| {
+                    SideEncoder::build(b, input, config.width, &decoded)
+                })
+            })
+            .transpose()?;
         Ok(Unet {
             encoder,
             bottom,
             decoder,
             head,
-            guides,
+            mixed,
+            side,
+            guides: config.guides,
         })
     }
 
@@ -95,12 +105,29 @@ impl Unet {
         self.guides
     }
 
+    /// The detail map of the features, or `None` for a network without fusion.
+    ///
+    /// # Shapes
+    /// `[B, 12, H, W]` to `[B, 3, H, W]`, not negative.
+    pub fn detail_map(&self, features: Tensor<4>, ops: Ops) -> Option<Tensor<4>> {
+        let fusion = self.side.as_ref()?.fusion.as_ref()?;
+        Some(fusion.forward(Maps::from_nchw(features, ops)).into_nchw())
+    }
+
     /// Denoises colour with guides, both in OIDN's value ranges.
     ///
     /// # Shapes
     /// `color` `[B, 3, H, W]`; `features` `[B, 12, H, W]`, of which albedo and normal count; H and W
     /// multiples of 16. Returns the shape of `color`, not negative.
     pub fn forward(&self, color: Tensor<4>, features: Tensor<4>, ops: Ops) -> Tensor<4> {
+        let noisy = self
+            .mixed
+            .as_ref()
+            .map(|_| Maps::from_nchw(color.clone(), ops));
+        let side = self
+            .side
+            .as_ref()
+            .map(|side| (side, side.forward(Maps::from_nchw(features.clone(), ops))));
         let mut inputs = vec![color];
         for first in self.guides.first_channels() {
             inputs.push(features.clone().narrow(1, *first, COLOR_CHANNELS));
@@ -112,33 +139,19 @@ impl Unet {
             x = level.forward(x).max_pool();
         }
         x = self.bottom.forward(x);
-        for level in &self.decoder {
+        let mut decoded = Vec::with_capacity(UNET_LEVELS);
+        for (index, level) in self.decoder.iter().enumerate() {
             let skip = skips.pop().expect("a skip for each level");
             x = level.forward(x.double_and_append(skip));
+            if let Some((side, maps)) = &side {
+                x = side.fuse(index, x, maps[index].clone());
+            }
+            decoded.push(x.clone());
         }
-        x.conv3x3(&self.head, Activation::Relu).into_nchw()
-    }
-}
-
-impl UnetLevel {
-    fn build(b: &mut Builder, inputs: usize, outputs: &[usize]) -> Result<Self, WeightsError> {
-        let mut channels = inputs;
-        let convs = b.list("convs", outputs.len(), |b, index| {
-            let built = conv3x3(
-                b,
-                [channels, outputs[index]],
-                Init::Xavier(1.0),
-                Init::Zeros,
-            );
-            channels = outputs[index];
-            built
-        })?;
-        Ok(UnetLevel { convs })
-    }
-
-    fn forward(&self, x: Maps) -> Maps {
-        self.convs
-            .iter()
-            .fold(x, |x, conv| x.conv3x3(conv, Activation::Relu))
+        let direct = x.conv3x3(&self.head, Activation::Relu);
+        match (&self.mixed, noisy) {
+            (Some(mixed), Some(noisy)) => mixed.forward(direct, decoded, noisy).into_nchw(),
+            _ => direct.into_nchw(),
+        }
     }
 }

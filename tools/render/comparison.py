@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from patterns import TEXTURE_SIDE, Rng, color, environment, noise
 from rooms import Room
-from stage import square_film, tiled
+from stage import globe, matt, rgb, square_film, tiled
 from stills import Still
 from variant import mi
 
@@ -305,15 +305,14 @@ class ComparisonRoom(Comparison, Room):
         for _ in range(rng.integers(1, 3)):
             at, count = rng.uniform(0.25, 0.75, 2) * [x, y], int(rng.integers(5, 14))
             power = tint * np.exp(rng.uniform(np.log(20), np.log(200)))
-            light = {"type": "area", "radiance": {"type": "rgb", "value": power.tolist()}}
             ring = rng.random() < 0.5
-            for lamp in range(count):
-                angle, share = 2 * np.pi * lamp / count, lamp / (count - 1)
+            for number in range(count):
+                angle, share = 2 * np.pi * number / count, number / (count - 1)
                 if ring:
                     centre = [*(at + 0.4 * np.array([np.cos(angle), np.sin(angle)])), z - 0.35]
                 else:
                     centre = [0.1 * x + 0.8 * x * share, at[1], z - 0.15 - 1.2 * share * (1 - share)]
-                self.add({"type": "sphere", "center": [float(v) for v in centre], "radius": 0.035, "emitter": light})
+                self.add(globe(centre, 0.035, power))
 
 
     def sun(self, rng: Rng) -> None:
@@ -325,7 +324,7 @@ class ComparisonRoom(Comparison, Room):
         at = [float(outside[0] + rng.uniform(-2, 2)), float(outside[1] + rng.uniform(-2, 2)), float(z + rng.uniform(0, 4))]
         tint, power = np.array([1, rng.uniform(0.6, 1), rng.uniform(0.3, 1)]), np.exp(rng.uniform(np.log(100), np.log(3000)))
         to_world = mi.ScalarTransform4f().look_at(at, [float(x / 2), float(y / 2), float(0.3 * z)], [0.1, 0.1, 1])
-        light = {"type": "spot", "to_world": to_world, "cutoff_angle": 35.0, "intensity": {"type": "rgb", "value": (tint * power).tolist()}}
+        light = {"type": "spot", "to_world": to_world, "cutoff_angle": 35.0, "intensity": rgb(tint * power)}
         self.scene["sun"] = light
 
 
@@ -350,7 +349,7 @@ class GlassBalls(ComparisonStill):
     def surface(self, side: float) -> dict:
         """A patterned floor without gloss."""
         image = self.pattern(self.rng, np.array(self.tint()), np.array(self.tint()))
-        return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": tiled(image, float(side / (2 * self.reach)))}}
+        return matt(tiled(image, float(side / (2 * self.reach))))
 
     def arrange(self) -> None:
         rng, at = self.rng, -0.5

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from stage import Stage
+from stage import Stage, matt
 from variant import mi
 
 
@@ -80,7 +80,7 @@ class Furnished(Stage):
     def plant(self, place) -> None:
         rng = self.rng
         green = [float(v) for v in rng.uniform([0.03, 0.15, 0.02], [0.3, 0.5, 0.15])]
-        leaf = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": green}}}
+        leaf = matt({"type": "rgb", "value": green})
         h, r = rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.22)
         self.rod([0, 0, 0], [0, 0, h], r, self.any_material(), place)
         self.add({"type": "disk", "to_world": place.translate([0, 0, float(h)]).scale([float(r), float(r), 1])}, self.any_material())

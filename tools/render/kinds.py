@@ -10,22 +10,11 @@ import tempfile
 
 import numpy as np
 from patterns import Rng, color
-from stage import METALS
+from stage import METALS, globe, matt, rgb
 from stills import Still
 from variant import mi
 
 UPRIGHT = np.array([0.0, 0.0, 1.0])
-
-
-def lamp(at, radius: float, power: np.ndarray) -> dict:
-    """A glowing ball."""
-    light = {"type": "area", "radiance": {"type": "rgb", "value": [float(v) for v in power]}}
-    return {"type": "sphere", "center": [float(v) for v in at], "radius": float(radius), "emitter": light}
-
-
-def plain(tint) -> dict:
-    """A matt material, the same on both sides."""
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [float(v) for v in tint]}}}
 
 
 class Glassware:
@@ -54,7 +43,7 @@ class Glassware:
             at = reach * np.array([*rng.uniform(-2, 2, 2), rng.uniform(1.5, 4)])
             radius = reach * rng.uniform(0.03, 0.15)
             tint = np.array([1, rng.uniform(0.6, 1), rng.uniform(0.4, 1)])
-            self.add(lamp(at, radius, tint * rng.uniform(3, 30) * (reach / radius) ** 2 / 4))
+            self.add(globe(at, radius, tint * rng.uniform(3, 30) * (reach / radius) ** 2 / 4))
 
 
 class Lights:
@@ -67,16 +56,16 @@ class Lights:
         self.scene["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(dark.astype(np.float32))}
         tints = [rng.uniform(0.1, 1, 3) if rng.random() < 0.5 else np.array([1, 0.8, 0.6]) for _ in range(4)]
         count, radius = int(rng.integers(8, 48)), reach * rng.uniform(0.01, 0.04)
-        strings = rng.random() < 0.5
+        strings, turns = rng.random() < 0.5, rng.integers(1, 4)
         for number in range(count):
             share = number / count
             if strings:
-                turn, high = 2 * np.pi * share * rng.integers(1, 4), 0.6 + 0.4 * np.cos(8 * np.pi * share)
+                turn, high = 2 * np.pi * share * turns, 0.6 + 0.4 * np.cos(8 * np.pi * share)
                 at = reach * np.array([1.3 * np.cos(turn), 1.3 * np.sin(turn), high])
             else:
                 at = reach * np.array([*rng.normal(0, 0.8, 2), rng.uniform(0.05, 1.2)])
             power = tints[number % len(tints)] * np.exp(rng.uniform(np.log(0.3), np.log(3)))
-            self.add(lamp(at, radius, power * (reach / radius) ** 2 / count))
+            self.add(globe(at, radius, power * (reach / radius) ** 2 / count))
 
 
 class Foliage:
@@ -85,7 +74,7 @@ class Foliage:
     def arrange(self) -> None:
         super().arrange()
         rng, reach = self.rng, self.reach
-        greens = [plain(rng.uniform([0.03, 0.12, 0.02], [0.35, 0.45, 0.15])) for _ in range(3)]
+        greens = [matt(rgb(rng.uniform([0.03, 0.12, 0.02], [0.35, 0.45, 0.15]))) for _ in range(3)]
         if rng.random() < 0.8:
             blades = int(rng.integers(2000, 20000))
             feet = np.concatenate([rng.uniform(-1.5, 1.5, (blades, 2)) * reach, np.zeros((blades, 1))], 1)
@@ -95,14 +84,12 @@ class Foliage:
             foot = np.array([*rng.uniform(-1.2, 1.2, 2) * reach, 0])
             height, spread, count = reach * rng.uniform(0.4, 1.6), reach * rng.uniform(0.15, 0.5), int(rng.integers(500, 5000))
             trunk = height * rng.uniform(0, 0.6)
-            self.rod(foot, foot + UPRIGHT * (trunk + 0.3 * spread), 0.06 * spread, plain(rng.uniform(0.03, 0.3, 3)))
+            self.rod(foot, foot + UPRIGHT * (trunk + 0.3 * spread), 0.06 * spread, matt(rgb(rng.uniform(0.03, 0.3, 3))))
             ball = rng.normal(0, 1, (count, 3))
             ball *= (rng.random((count, 1)) ** 0.4 * spread) / np.linalg.norm(ball, axis=1, keepdims=True)
             self.leaves(foot + UPRIGHT * (trunk + spread) + ball, rng.normal(0, 1, (count, 3)) * spread * rng.uniform(0.06, 0.2), 0.35, greens[1 + rng.integers(2)])
         elevation, azimuth = np.radians(rng.uniform(15, 70)), rng.uniform(0, 2 * np.pi)
-        towards = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-        power = rng.uniform(4, 30) * np.array([1, rng.uniform(0.75, 1), rng.uniform(0.5, 1)])
-        self.scene["sun"] = {"type": "directional", "direction": (-towards).tolist(), "irradiance": {"type": "rgb", "value": power.tolist()}}
+        self.add_sun(elevation, azimuth, rng.uniform(4, 30) * np.array([1, rng.uniform(0.75, 1), rng.uniform(0.5, 1)]))
 
     def leaves(self, feet: np.ndarray, along: np.ndarray, width: float, bsdf: dict) -> None:
         """Pointed leaves `[N, 3]`; `width` is a part of their length."""
@@ -150,7 +137,7 @@ class Fine:
         ink &= words[y // cell, x // cell] & (x > side // 12) & (x < side - side // 12)
         paper, black = np.array(color(rng)) * 0.3 + 0.6, np.array(color(rng)) * 0.15
         image = np.where(ink[..., None], black, paper).astype(np.float32)
-        return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(image), "raw": True}}}
+        return matt({"type": "bitmap", "bitmap": mi.Bitmap(image), "raw": True})
 
 
 class Fur:
@@ -170,7 +157,7 @@ class Fur:
                 roots = np.concatenate([middle[:2] + rng.uniform(-2, 2, (strands, 2)) * r, np.zeros((strands, 1))], 1)
                 outward = UPRIGHT + rng.normal(0, 0.2, (strands, 3))
             else:
-                self.ball(middle, r, plain(rng.uniform(0.02, 0.4, 3)))
+                self.ball(middle, r, matt(rgb(rng.uniform(0.02, 0.4, 3))))
             self.hair(roots, outward * length, length * rng.uniform(0.005, 0.02))
 
     def hair(self, roots: np.ndarray, along: np.ndarray, radius: float) -> None:
@@ -187,7 +174,7 @@ class Fur:
             kind = rng.random()
             bsdf = {"type": "hair", "eumelanin": float(8 * rng.random() ** 3), "pheomelanin": float(rng.random() ** 2)}
             if kind < 0.3:
-                bsdf = {"type": "roughplastic", "diffuse_reflectance": {"type": "rgb", "value": color(rng)}, "alpha": 0.2}
+                bsdf = {"type": "roughplastic", "diffuse_reflectance": rgb(color(rng)), "alpha": 0.2}
                 bsdf = {"type": "twosided", "bsdf": bsdf}
             self.scene[f"shape{len(self.scene)}"] = mi.load_dict({"type": "bsplinecurve", "filename": file.name, "bsdf": bsdf})
 

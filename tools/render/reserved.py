@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from patterns import TEXTURE_SIDE, Rng, color, environment, noise
 from rooms import Room
+from stage import rgb
 from stills import Still
 from variant import mi
 
@@ -319,23 +320,22 @@ class ReservedRoom(Reserved, Room):
                 power = np.exp(rng.uniform(np.log(8), np.log(80)))
                 ends = [[*(at - along), z - 0.12], [*(at + along), z - 0.12]]
                 p0, p1 = ([float(v) for v in end] for end in ends)
-                light = {"type": "area", "radiance": {"type": "rgb", "value": (tint * power).tolist()}}
+                light = {"type": "area", "radiance": rgb(tint * power)}
                 self.add({"type": "cylinder", "p0": p0, "p1": p1, "radius": float(rng.uniform(0.012, 0.03)), "emitter": light})
             else:
                 target = [*(rng.uniform(0.2, 0.8, 2) * [x, y]), 0.5]
                 power = np.exp(rng.uniform(np.log(5), np.log(60)))
                 to_world = mi.ScalarTransform4f().look_at([*at.tolist(), float(z) - 0.05], [float(v) for v in target], [0.1, 1, 0.2])
                 spot = {"type": "spot", "to_world": to_world, "cutoff_angle": float(rng.uniform(20, 60))}
-                self.scene[f"spot{len(self.scene)}"] = spot | {"intensity": {"type": "rgb", "value": (tint * power).tolist()}}
+                self.scene[f"spot{len(self.scene)}"] = spot | {"intensity": rgb(tint * power)}
 
     def sun(self, rng: Rng) -> None:
         """A directional sun through the skylights, if the room has some."""
         if not self.skylit:
             return
         elevation, azimuth = np.radians(rng.uniform(40, 85)), rng.uniform(0, 2 * np.pi)
-        towards = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-        irradiance = np.exp(rng.uniform(np.log(2), np.log(60))) * np.array([1, rng.uniform(0.75, 1), rng.uniform(0.5, 1)])
-        self.scene["sun"] = {"type": "directional", "direction": (-towards).tolist(), "irradiance": {"type": "rgb", "value": irradiance.tolist()}}
+        power = np.exp(rng.uniform(np.log(2), np.log(60)))
+        self.add_sun(elevation, azimuth, power * np.array([1, rng.uniform(0.75, 1), rng.uniform(0.5, 1)]))
 
 
 class ReservedStill(Reserved, Still):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from furniture import Furnished
 from patterns import Rng, mosaic
-from stage import square_film
+from stage import globe, matt, rgb, square_film
 from variant import mi
 
 
@@ -39,7 +39,7 @@ class Room(Furnished):
         """Floor, ceiling, and four walls; with `windows`, one to three of them have windows."""
         rng, (x, y, z) = self.rng, self.size
         self.box([0, 0, -0.1], [x, y, 0], self.material())
-        self.ceiling({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": float(rng.uniform(0.5, 0.9))}}})
+        self.ceiling(matt({"type": "rgb", "value": float(rng.uniform(0.5, 0.9))}))
         wall, other = self.material(plain=True), self.material(plain=True)
         self.open_sides = rng.choice(4, rng.choice([1, 1, 2, 3]), replace=False).tolist() if windows else []
         for side in range(4):
@@ -104,7 +104,7 @@ class Room(Furnished):
             image = self.picture(rng, [self.tint() for _ in range(5)])
             canvas = {"type": "bitmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "raw": True}
             self.box([x - 0.04, 0, z - 0.04], [x + w + 0.04, 0.03, z + h + 0.04], self.any_material(), place)
-            self.box([x, 0.03, z], [x + w, 0.035, z + h], {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": canvas}}, place)
+            self.box([x, 0.03, z], [x + w, 0.035, z + h], matt(canvas), place)
 
     def lamps(self) -> None:
         """Ceiling panels, and hanging or standing globes."""
@@ -113,15 +113,14 @@ class Room(Furnished):
         for _ in range(rng.integers(1, 5)):
             at = [float(rng.uniform(0.15, 0.85) * side) for side in (x, y)]
             power = float(np.exp(rng.uniform(np.log(3), np.log(60))))
-            light = {"type": "area", "radiance": {"type": "rgb", "value": (warm * power).tolist()}}
             if rng.random() < 0.5:
                 half = [float(v) for v in rng.uniform(0.05, 0.6, 2)]
                 to_world = mi.ScalarTransform4f().translate([*at, float(z) - 0.02]).rotate([1, 0, 0], 180).scale([*half, 1])
-                self.add({"type": "rectangle", "to_world": to_world, "emitter": light})
+                self.add({"type": "rectangle", "to_world": to_world, "emitter": {"type": "area", "radiance": rgb(warm * power)}})
             else:
                 radius = float(rng.uniform(0.04, 0.15))
                 height = float(rng.uniform(1.2, z - 0.2))
-                self.add({"type": "sphere", "center": [*at, height], "radius": radius, "emitter": light})
+                self.add(globe([*at, height], radius, warm * power))
                 hanging = rng.random() < 0.5
                 self.rod([*at, height + radius if hanging else 0], [*at, z if hanging else height - radius], 0.015, self.any_material())
 
@@ -132,22 +131,15 @@ class Room(Furnished):
         elevation = np.radians(rng.uniform(10, 55))
         # The outside of wall 0 is at -y.
         azimuth = np.radians(90 * (rng.choice(self.open_sides) - 1) + rng.uniform(-55, 55))
-        towards = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         power = np.exp(rng.uniform(np.log(2), np.log(60)))
-        irradiance = power * np.array([1, rng.uniform(0.75, 1), rng.uniform(0.5, 1)])
-        self.scene["sun"] = {
-            "type": "directional",
-            "direction": (-towards).tolist(),
-            "irradiance": {"type": "rgb", "value": irradiance.tolist()},
-        }
+        self.add_sun(elevation, azimuth, power * np.array([1, rng.uniform(0.75, 1), rng.uniform(0.5, 1)]))
 
     def blacken(self, rng: Rng) -> None:
         """Makes bars and blinds black, and everything else of their material.
 
         `color` yields no black, but real slats in front of a bright sky are often black.
         """
-        reflectance = {"type": "rgb", "value": float(rng.uniform(0, 0.02))}
-        black = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
+        black = matt({"type": "rgb", "value": float(rng.uniform(0, 0.02))})
         for shape in self.scene.values():
             if isinstance(shape, dict) and any(shape.get("bsdf") is frame for frame in self.frames):
                 shape["bsdf"] = black

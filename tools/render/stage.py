@@ -22,6 +22,22 @@ def square_film(side: int) -> dict:
     return {"type": "hdrfilm", "width": side, "height": side, "rfilter": {"type": "box"}}
 
 
+def rgb(values) -> dict:
+    """A colour, or radiance."""
+    return {"type": "rgb", "value": [float(v) for v in values]}
+
+
+def matt(paint: dict) -> dict:
+    """A matt material, the same on both sides."""
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": paint}}
+
+
+def globe(at, radius: float, radiance) -> dict:
+    """A glowing ball."""
+    light = {"type": "area", "radiance": rgb(radiance)}
+    return {"type": "sphere", "center": [float(v) for v in at], "radius": float(radius), "emitter": light}
+
+
 class Stage:
     """Materials, and shapes made of them.
 
@@ -79,6 +95,14 @@ class Stage:
 
     def any_material(self) -> dict:
         return self.materials[self.rng.integers(len(self.materials))]
+
+    # Light.
+
+    def add_sun(self, elevation: float, azimuth: float, irradiance) -> None:
+        """A sun in this direction, in radians: hard shadows."""
+        towards = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        away = [-float(v) for v in towards]
+        self.scene["sun"] = {"type": "directional", "direction": away, "irradiance": rgb(irradiance)}
 
     # Shapes.
 

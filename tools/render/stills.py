@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from furniture import Furnished
 from patterns import Rng, studio
-from stage import RINGS, square_film, tiled
+from stage import RINGS, matt, square_film, tiled
 from variant import mi
 
 
@@ -43,7 +43,7 @@ class Still(Furnished):
         tile = self.reach * np.exp(rng.uniform(np.log(0.4), np.log(3)))
         paint = tiled(image, float(side / tile))
         if rng.random() < 0.6:
-            return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": paint}}
+            return matt(paint)
         gloss = {"type": "roughplastic", "diffuse_reflectance": paint, "alpha": float(rng.uniform(0.1, 0.5)), "nonlinear": True}
         return {"type": "twosided", "bsdf": gloss}
 

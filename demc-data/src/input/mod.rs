@@ -7,7 +7,6 @@ pub mod kpcn;
 pub(crate) mod moments;
 pub mod position;
 pub mod preparation;
-pub mod pu;
 pub mod ranges;
 pub mod transfer;
 pub mod transform;

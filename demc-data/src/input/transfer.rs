@@ -3,9 +3,9 @@
 //! Open Image Denoise (OIDN) 2 compresses radiance with a perceptually uniform curve (PU), after it has
 //! scaled the image to an exposure. Its networks expect both.
 
+use demc_kernels::pu::{self, PEAK};
 use serde::{Deserialize, Serialize};
 
-use crate::input::pu::{self, PEAK};
 use crate::input::ranges;
 
 /// Sides of the bins, in pixels, over which OIDN averages the luminance. They are a little smaller where

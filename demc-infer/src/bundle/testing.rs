@@ -2,7 +2,9 @@
 
 use burn::tensor::Device;
 use demc_data::input::kpcn::PASS_PLANES;
-use demc_data::{ChannelLayout, FEATURES, FeatureStats, Frame, Normalizer, PositionSpace};
+use demc_data::{
+    ChannelLayout, FEATURES, FeatureStats, Frame, Normalizer, PositionSpace, Transfer,
+};
 use demc_model::unet::UnetSize;
 use demc_model::{Head, ModelConfig, Reading, Variant, Weights};
 use rand::RngExt;
@@ -33,11 +35,17 @@ pub(crate) fn kernel_bundle() -> Bundle {
     bundle
 }
 
-fn bundle_with(variant: Variant, head: Head) -> Bundle {
+pub(crate) fn bundle_with(variant: Variant, head: Head) -> Bundle {
     let model = match variant {
-        Variant::Unet => ModelConfig {
+        _ if variant.is_unet() => ModelConfig {
             variant,
             size: UnetSize::Small,
+            width: if variant == Variant::Unet {
+                ModelConfig::default().width
+            } else {
+                2
+            },
+            head,
             ..ModelConfig::default()
         },
         _ => ModelConfig {
@@ -55,11 +63,15 @@ fn bundle_with(variant: Variant, head: Head) -> Bundle {
         mean: std::array::from_fn(|channel| 0.1 * channel as f32),
         std: std::array::from_fn(|channel| 0.3 + 0.1 * channel as f32),
     };
+    let transfer = match head {
+        Head::Mixed => Transfer::Pu,
+        Head::Grey | Head::Xavier | Head::Kernel => Transfer::Gamma,
+    };
     let normalizer = Normalizer {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
         position: PositionSpace::Scene,
-        transfer: demc_data::Transfer::Gamma,
+        transfer,
         exposure_level: None,
         restore_light: false,
         features,

@@ -29,7 +29,27 @@ impl GraphBuilder {
         color_gamma: &Value,
     ) -> Value {
         let gamma = self.constant("kernels.gamma", &[], &[GAMMA]);
-        let mut scales = vec![self.node("Pow", "kernels.image.0", &[color_gamma, &gamma], &[])];
+        let image = self.node("Pow", "kernels.image", &[color_gamma, &gamma], &[]);
+        let out = self.filtered_on_all_scales(kernels, decoded, image);
+        let darkest = self.constant("kernels.darkest", &[], &[DARKEST]);
+        let visible = self.node("Greater", "kernels.visible", &[&out, &darkest], &[]);
+        let target = [("to", AttributeValue::Int(1))];
+        let factor = self.node("Cast", "kernels.visible.f32", &[&visible], &target);
+        let bright = self.node("Max", "kernels.bright", &[&out, &darkest], &[]);
+        let exponent = self.constant("kernels.inverse_gamma", &[], &[1.0 / GAMMA]);
+        let power = self.node("Pow", "kernels.power", &[&bright, &exponent], &[]);
+        self.node("Mul", "output_gamma", &[&power, &factor], &[])
+    }
+
+    /// An image in linear light, filtered with predicted kernels. `decoded` are the decoder's maps, deepest
+    /// first.
+    pub(super) fn filtered_on_all_scales(
+        &mut self,
+        kernels: &[Conv2d],
+        decoded: &[Value],
+        image: Value,
+    ) -> Value {
+        let mut scales = vec![image];
         for level in 1..KERNEL_LEVELS {
             let image = scales[level - 1].clone();
             scales.push(self.halved(&format!("kernels.image.{level}"), &image));
@@ -52,15 +72,7 @@ impl GraphBuilder {
                 }
             });
         }
-        let out = out.expect("a kernel head has levels");
-        let darkest = self.constant("kernels.darkest", &[], &[DARKEST]);
-        let visible = self.node("Greater", "kernels.visible", &[&out, &darkest], &[]);
-        let target = [("to", AttributeValue::Int(1))];
-        let factor = self.node("Cast", "kernels.visible.f32", &[&visible], &target);
-        let bright = self.node("Max", "kernels.bright", &[&out, &darkest], &[]);
-        let exponent = self.constant("kernels.inverse_gamma", &[], &[1.0 / GAMMA]);
-        let power = self.node("Pow", "kernels.power", &[&bright, &exponent], &[]);
-        self.node("Mul", "output_gamma", &[&power, &factor], &[])
+        out.expect("a kernel head has levels")
     }
 
     /// One-hot kernels `[3 N, 1, side, side]`: the N neighbours of each channel.

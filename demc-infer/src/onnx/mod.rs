@@ -38,7 +38,6 @@ use std::path::Path;
 
 use demc_data::InputKind;
 use demc_data::image::frame::FEATURE_NAMES;
-use demc_model::Variant;
 use demc_model::config::FEATURE_CHANNELS;
 
 use crate::bundle::Description;
@@ -110,20 +109,20 @@ struct Texts {
     documentation: &'static str,
 }
 
-const UNET_DOCUMENTATION: &str = "The U-Net of Open Image Denoise. \
+const UNET_DOCUMENTATION: &str = "The U-Net of Open Image Denoise, or one that grew from it. \
     color [batch, 3, height, width] is noisy radiance in linear HDR, times a factor s; divide the output by s. \
     s is normalizer.exposure_level / the geometric mean of the luminance of the image's 16x16 pixels. \
     features [batch, 12, height, width] are shading normal xyz, world position xyz, and albedo RGB at the \
     first and at the second intersection. Of these, the guides of the model in the metadata count: the first albedo, \
-    and the normal. output [batch, 3, height, width] is radiance in linear HDR. \
-    Height and width must be multiples of 16: append rows and columns of color 0, albedo 0, and normal -1, and \
-    crop the output. Values must be finite. \
+    and the normal; for unet-demc and unet-nosn, all. output [batch, 3, height, width] is radiance in linear HDR. \
+    Height and width must be multiples of 16: append rows and columns of color 0, albedo 0, normal -1, and \
+    the metadata's means of the other features, and crop the output. Values must be finite. \
     Metadata: `demc` holds model, statistics, channel names and training step as JSON, `demc.features` the \
     order of the features.";
 
 impl Texts {
     fn of(bundle: &Bundle) -> Self {
-        if bundle.meta.model.variant == Variant::Unet {
+        if bundle.meta.model.variant.is_unet() {
             return Self {
                 color: "radiance, linear HDR",
                 features: FEATURE_NAMES,

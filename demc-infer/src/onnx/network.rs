@@ -13,6 +13,7 @@ use demc_model::decoder::DecoderLevel;
 use demc_model::denoiser::Body;
 use demc_model::dual_encoder::DualEncoder;
 use demc_model::encoder::EncoderLevel;
+use demc_model::fusion::Fusion;
 use demc_model::inference::{FoldedConv, norm_scale};
 use demc_model::layers::ConvBlock;
 use demc_model::{Denoiser, Role, WeightSpec};
@@ -41,10 +42,8 @@ impl GraphBuilder {
         let modulation = self.modulation(normalizer, &features);
         let color_gamma = self.compressed(normalizer, modulation.as_ref());
         let features_z = self.features_z(normalizer, &features);
-        let detail = model.fusion.as_ref().map(|fusion| {
-            let blocks = fusion.blocks.iter();
-            blocks.fold(features_z.clone(), |x, block| self.block(&x, block))
-        });
+        let fusion = model.fusion.as_ref();
+        let detail = fusion.map(|fusion| self.detail_map(&features_z, fusion));
         let image = |input: &Input| match input {
             Input::Color => &color_gamma,
             Input::Features => &features_z,
@@ -135,6 +134,11 @@ impl GraphBuilder {
         let std = self.constant("features_std", &shape, &normalizer.features.std);
         let centred = self.node("Sub", "features_centred", &[features, &mean], &[]);
         self.node("Div", "features_z", &[&centred, &std], &[])
+    }
+
+    pub(super) fn detail_map(&mut self, features: &Value, fusion: &Fusion) -> Value {
+        let blocks = fusion.blocks.iter();
+        blocks.fold(features.clone(), |x, block| self.block(&x, block))
     }
 
     fn block(&mut self, x: &Value, block: &ConvBlock) -> Value {

@@ -1,7 +1,7 @@
 //! The curve between linear radiance and the network's colour as a graph.
 
-use demc_data::input::pu::{self, A, B, C, D, E, F, G, PEAK, X0, X1, Y0, Y1};
 use demc_data::{Normalizer, Transfer};
+use demc_kernels::pu::{self, A, B, C, D, E, F, G, PEAK, X0, X1, Y0, Y1};
 
 use super::graph::{GraphBuilder, Value};
 use super::network::{COLOR, OUTPUT};
@@ -19,7 +19,7 @@ impl GraphBuilder {
                 let exponent = self.constant("inverse_gamma", &[], &[1.0 / normalizer.gamma]);
                 self.node("Pow", "color_gamma", &[&positive, &exponent], &[])
             }
-            Transfer::Pu => self.pu(&positive),
+            Transfer::Pu => self.pu("pu", &positive),
         };
         match modulation {
             Some(modulation) => self.node("Div", "color_demodulated", &[&color, modulation], &[]),
@@ -38,48 +38,46 @@ impl GraphBuilder {
         }
     }
 
-    fn scalar(&mut self, name: &str, value: f32) -> Value {
-        self.constant(&format!("pu.{name}"), &[], &[value])
-    }
-
     /// `x op value`, as node and constant of this name.
     fn with(&mut self, op: &str, name: &str, x: &Value, value: f32) -> Value {
-        let constant = self.scalar(&format!("{name}.constant"), value);
-        self.node(op, &format!("pu.{name}"), &[x, &constant], &[])
+        let constant = self.constant(&format!("{name}.constant"), &[], &[value]);
+        self.node(op, name, &[x, &constant], &[])
     }
 
-    /// See [`pu::value`].
-    fn pu(&mut self, y: &Value) -> Value {
-        let dark = self.with("Mul", "dark", y, A);
-        let power = self.with("Pow", "power", y, C);
-        let scaled = self.with("Mul", "scaled", &power, B);
-        let middle = self.with("Add", "middle", &scaled, D);
-        let shifted = self.with("Add", "shifted", y, F);
-        let logarithm = self.node("Log", "pu.logarithm", &[&shifted], &[]);
-        let steep = self.with("Mul", "steep", &logarithm, E);
-        let bright = self.with("Add", "bright", &steep, G);
-        let is_dark = self.with("LessOrEqual", "is_dark", y, Y0);
-        let is_middle = self.with("LessOrEqual", "is_middle", y, Y1);
-        let upper = self.node("Where", "pu.upper", &[&is_middle, &middle, &bright], &[]);
-        let value = self.node("Where", "pu.value", &[&is_dark, &dark, &upper], &[]);
-        self.with("Div", "color", &value, pu::value(PEAK))
+    /// See [`pu::value`]. Names of values begin with `part`.
+    pub(super) fn pu(&mut self, part: &str, y: &Value) -> Value {
+        let name = |what: &str| format!("{part}.{what}");
+        let dark = self.with("Mul", &name("dark"), y, A);
+        let power = self.with("Pow", &name("power"), y, C);
+        let scaled = self.with("Mul", &name("scaled"), &power, B);
+        let middle = self.with("Add", &name("middle"), &scaled, D);
+        let shifted = self.with("Add", &name("shifted"), y, F);
+        let logarithm = self.node("Log", &name("logarithm"), &[&shifted], &[]);
+        let steep = self.with("Mul", &name("steep"), &logarithm, E);
+        let bright = self.with("Add", &name("bright"), &steep, G);
+        let is_dark = self.with("LessOrEqual", &name("is_dark"), y, Y0);
+        let is_middle = self.with("LessOrEqual", &name("is_middle"), y, Y1);
+        let upper = [&is_middle, &middle, &bright];
+        let upper = self.node("Where", &name("upper"), &upper, &[]);
+        let value = self.node("Where", &name("value"), &[&is_dark, &dark, &upper], &[]);
+        self.with("Div", &name("color"), &value, pu::value(PEAK))
     }
 
     /// See [`pu::inverse`].
     fn pu_inverse(&mut self, image: &Value) {
-        let x = self.with("Mul", "out.value", image, pu::value(PEAK));
-        let dark = self.with("Div", "out.dark", &x, A);
-        let shifted = self.with("Sub", "out.shifted", &x, D);
+        let x = self.with("Mul", "pu.out.value", image, pu::value(PEAK));
+        let dark = self.with("Div", "pu.out.dark", &x, A);
+        let shifted = self.with("Sub", "pu.out.shifted", &x, D);
         // A power of a negative number is undefined, and a runtime computes both branches.
         let positive = self.node("Relu", "pu.out.positive", &[&shifted], &[]);
-        let scaled = self.with("Div", "out.scaled", &positive, B);
-        let middle = self.with("Pow", "out.middle", &scaled, 1.0 / C);
-        let lowered = self.with("Sub", "out.lowered", &x, G);
-        let flat = self.with("Div", "out.flat", &lowered, E);
+        let scaled = self.with("Div", "pu.out.scaled", &positive, B);
+        let middle = self.with("Pow", "pu.out.middle", &scaled, 1.0 / C);
+        let lowered = self.with("Sub", "pu.out.lowered", &x, G);
+        let flat = self.with("Div", "pu.out.flat", &lowered, E);
         let exponential = self.node("Exp", "pu.out.exponential", &[&flat], &[]);
-        let bright = self.with("Sub", "out.bright", &exponential, F);
-        let is_dark = self.with("LessOrEqual", "out.is_dark", &x, X0);
-        let is_middle = self.with("LessOrEqual", "out.is_middle", &x, X1);
+        let bright = self.with("Sub", "pu.out.bright", &exponential, F);
+        let is_dark = self.with("LessOrEqual", "pu.out.is_dark", &x, X0);
+        let is_middle = self.with("LessOrEqual", "pu.out.is_middle", &x, X1);
         let upper = self.node(
             "Where",
             "pu.out.upper",

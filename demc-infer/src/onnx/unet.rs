@@ -2,22 +2,30 @@
 
 use demc_data::Normalizer;
 use demc_model::config::COLOR_CHANNELS;
-use demc_model::unet::{Unet, UnetLevel};
+use demc_model::layers::ConvStack;
+use demc_model::mixed_head::MixedHead;
+use demc_model::side_encoder::SideEncoder;
+use demc_model::unet::Unet;
 
 use super::graph::{AttributeValue, GraphBuilder, Value};
 
 impl GraphBuilder {
     pub(super) fn unet(&mut self, network: &Unet, normalizer: &Normalizer) {
-        let mut inputs = vec![self.compressed(normalizer, None)];
+        let color = self.compressed(normalizer, None);
+        let mut inputs = vec![color.clone()];
         let guides = network.guides().first_channels();
-        if !guides.is_empty() {
+        let takes_features = !guides.is_empty() || network.side.is_some();
+        let features = takes_features.then(|| {
             let clamped = self.clamped_features(normalizer);
-            let features = self.features_z(normalizer, &clamped);
-            for first in guides {
-                let channels = *first..first + COLOR_CHANNELS;
-                inputs.push(self.channels(&format!("guide.{first}"), &features, channels));
-            }
+            self.features_z(normalizer, &clamped)
+        });
+        for first in guides {
+            let channels = *first..first + COLOR_CHANNELS;
+            let features = features.as_ref().expect("guides are features");
+            inputs.push(self.channels(&format!("guide.{first}"), features, channels));
         }
+        let side = network.side.as_ref().zip(features);
+        let mut side = side.map(|(side, features)| (side, self.side_maps(side, features)));
         let inputs: Vec<&Value> = inputs.iter().collect();
         let mut x = self.concat("inputs", &inputs);
         let mut skips = Vec::new();
@@ -27,17 +35,59 @@ impl GraphBuilder {
             x = self.pooled(&y);
         }
         x = self.unet_level(&x, &network.bottom);
-        for level in &network.decoder {
+        let mut decoded = Vec::new();
+        for (index, level) in network.decoder.iter().enumerate() {
             let skip = skips.pop().expect("a skip for each level");
             let both = self.doubled_with(&x, &skip);
             x = self.unet_level(&both, level);
+            if let Some((side, maps)) = &mut side {
+                let map = maps.pop().expect("a map for each level");
+                let both = self.concat(&format!("{}.fused", x.0), &[&x, &map]);
+                let fused = self.conv(&both, &side.fuses[index], None);
+                x = self.relu(&fused);
+            }
+            decoded.push(x.clone());
         }
         let y = self.conv(&x, &network.head, None);
-        let out = self.relu(&y);
+        let mut out = self.relu(&y);
+        if let Some(head) = &network.mixed {
+            out = self.mixed(head, &out, &decoded);
+        }
         self.expanded(normalizer, &out);
     }
 
-    fn unet_level(&mut self, x: &Value, level: &UnetLevel) -> Value {
+    /// The map of each level, from the full resolution down (`demc_model::side_encoder`).
+    fn side_maps(&mut self, side: &SideEncoder, features: Value) -> Vec<Value> {
+        let mut x = match &side.fusion {
+            Some(fusion) => self.detail_map(&features, fusion),
+            None => features,
+        };
+        let mut maps: Vec<Value> = Vec::new();
+        for level in &side.levels {
+            if !maps.is_empty() {
+                x = self.pooled(&x);
+            }
+            x = self.unet_level(&x, level);
+            maps.push(x.clone());
+        }
+        maps
+    }
+
+    /// The U-Net's image blended with the filtered one (`demc_model::mixed_head`).
+    fn mixed(&mut self, head: &MixedHead, direct: &Value, decoded: &[Value]) -> Value {
+        let noisy = Value("color_positive".into());
+        let filtered = self.filtered_on_all_scales(&head.kernels, decoded, noisy);
+        let filtered = self.node("Relu", "mixed.positive", &[&filtered], &[]);
+        let filtered = self.pu("mixed", &filtered);
+        let last = decoded.last().expect("a decoder has levels");
+        let logit = self.conv(last, &head.gate, None);
+        let gate = self.node("Sigmoid", "mixed.share", &[&logit], &[]);
+        let difference = self.node("Sub", "mixed.difference", &[&filtered, direct], &[]);
+        let change = self.node("Mul", "mixed.change", &[&difference, &gate], &[]);
+        self.node("Add", "mixed.out", &[direct, &change], &[])
+    }
+
+    fn unet_level(&mut self, x: &Value, level: &ConvStack) -> Value {
         level.convs.iter().fold(x.clone(), |x, conv| {
             let y = self.conv(&x, conv, None);
             self.relu(&y)

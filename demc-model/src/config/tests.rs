@@ -16,9 +16,15 @@ fn names_in_configurations_are_those_of_the_tables() {
 #[test]
 fn only_variants_with_a_detail_map_have_a_fusion() {
     let has_fusion = Variant::ALL.map(|variant| variant.spec().has_fusion());
-    assert_eq!(has_fusion, [true, false, true, false, false, false]);
+    assert_eq!(
+        has_fusion,
+        [true, false, true, false, false, false, true, false]
+    );
     let takes_features = Variant::ALL.map(|variant| variant.spec().takes_features());
-    assert_eq!(takes_features, [true, true, true, false, true, true]);
+    assert_eq!(
+        takes_features,
+        [true, true, true, false, true, true, true, true]
+    );
 }
 
 #[test]

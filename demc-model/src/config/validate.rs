@@ -1,6 +1,6 @@
 //! What is wrong with a `[model]` table.
 
-use super::{MAX_LEVEL, MAX_WIDTH, ModelConfig, Variant};
+use super::{Head, MAX_LEVEL, MAX_WIDTH, ModelConfig, Variant};
 use crate::unet_size::{Guides, UnetSize};
 
 impl ModelConfig {
@@ -25,10 +25,10 @@ impl ModelConfig {
                 width: self.width,
                 ..ModelConfig::default()
             },
-            Variant::Unet => ModelConfig {
-                size: self.size,
-                guides: self.guides,
-                ..ModelConfig::default()
+            Variant::Unet => self.of_unet(),
+            Variant::UnetDemc | Variant::UnetNosn => ModelConfig {
+                width: self.width,
+                ..self.of_unet()
             },
             _ => ModelConfig {
                 size: UnetSize::default(),
@@ -40,6 +40,20 @@ impl ModelConfig {
             variant: self.variant,
             ..used
         };
+        let heads: &[Head] = if self.variant.is_unet() {
+            &[Head::Grey, Head::Mixed]
+        } else {
+            &[Head::Grey, Head::Xavier, Head::Kernel]
+        };
+        if !heads.contains(&self.head) {
+            let names: Vec<&str> = heads.iter().map(|head| head.name()).collect();
+            problems.push(format!(
+                "model.head = \"{}\": {} has {}",
+                self.head.name(),
+                self.variant.spec().name,
+                names.join(", ")
+            ));
+        }
         if *self != used {
             let (unused, name) = (self.unused_keys(), self.variant.spec().name);
             problems.push(format!(
@@ -49,11 +63,22 @@ impl ModelConfig {
         problems
     }
 
+    /// The default configuration with these keys of U-Nets.
+    fn of_unet(&self) -> Self {
+        ModelConfig {
+            size: self.size,
+            guides: self.guides,
+            head: self.head,
+            ..ModelConfig::default()
+        }
+    }
+
     /// The keys of other variants, for a message.
     fn unused_keys(&self) -> &'static str {
         match self.variant {
             Variant::Kpcn => "reading, levels, head, detail, size, and guides",
-            Variant::Unet => "reading, width, levels, head, and detail",
+            Variant::Unet => "reading, width, levels, and detail",
+            Variant::UnetDemc | Variant::UnetNosn => "reading, levels, and detail",
             _ => "size and guides",
         }
     }

@@ -36,8 +36,10 @@ pub fn pass_bytes(
 ) -> u64 {
     match config.variant {
         Variant::Kpcn => return kpcn_bytes(config, height * width),
-        Variant::Unet if ops.has_fast_inference() => return unet_bytes(config, height, width),
-        Variant::Unet => {
+        Variant::Unet if ops.has_fast_inference() => {
+            return unet_bytes(config, height, width);
+        }
+        variant if variant.is_unet() => {
             let [.., [_, below], _] = config.size.spec().decoder;
             let channels = below + config.guides.channels();
             return BURN_VALUES * (channels * height * width * VALUE) as u64;
@@ -320,7 +322,7 @@ impl PeakEstimate<'_> {
                 let values: usize = levels.map(|pixels| pixels * COLOR_CHANNELS).sum();
                 values * self.filtered_images()
             }
-            Head::Grey | Head::Xavier => 0,
+            Head::Grey | Head::Xavier | Head::Mixed => 0,
         }
     }
 

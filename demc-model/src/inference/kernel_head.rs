@@ -4,6 +4,7 @@
 use std::ops::Range;
 
 use burn::backend::flex::FlexTensor;
+use burn::nn::conv::Conv2d;
 use burn::tensor::Tensor;
 use demc_kernels::blend::{self, Scales};
 use demc_kernels::conv1x1::{Epilogue, Part, forward_part};
@@ -15,9 +16,7 @@ use super::band::bands;
 use super::feature_maps::FeatureMaps;
 use super::folded::FoldedConv;
 use super::images::host;
-use super::pass::InferencePass;
 use crate::config::COLOR_CHANNELS;
-use crate::dual_encoder::DualEncoder;
 use crate::kernel_head::{DARKEST, GAMMA, KERNEL_LEVELS};
 
 pub(super) struct KernelHead {
@@ -33,45 +32,49 @@ pub(super) struct KernelHead {
     out: Option<FeatureMaps>,
 }
 
-impl KernelHead {
-    /// The kernel head of `model` for planar images in gamma space, and for layers in linear light,
-    /// `[layers, 3, H, W]`, of a single image.
-    pub(super) fn new(
-        isa: Isa,
-        model: &DualEncoder,
-        grid: Grid,
-        color: &FlexTensor,
-        layers: Option<Tensor<4>>,
-    ) -> Self {
-        let kernels = model.decoder.kernels.iter().rev();
-        let count = layers.as_ref().map_or(0, |layers| layers.dims()[0]);
-        let all = Grid {
-            batch: grid.batch + count,
+/// Images in linear light: planes in gamma space, and the layers `[layers, 3, H, W]` of a single image.
+pub(super) fn linear_images(
+    isa: Isa,
+    grid: Grid,
+    color: &FlexTensor,
+    layers: Option<Tensor<4>>,
+) -> FeatureMaps {
+    let count = layers.as_ref().map_or(0, |layers| layers.dims()[0]);
+    let all = Grid {
+        batch: grid.batch + count,
+        ..grid
+    };
+    let mut images = FeatureMaps::new(all, COLOR_CHANNELS);
+    let (colors, others) = images.values.split_at_mut(grid.pixels() * COLOR_CHANNELS);
+    grid::nhwc_from_nchw(grid, color.storage::<f32>(), colors);
+    power::positive_powers(isa, colors, GAMMA);
+    if let Some(layers) = layers.map(host) {
+        let grid = Grid {
+            batch: count,
             ..grid
         };
-        let mut image = FeatureMaps::new(all, COLOR_CHANNELS);
-        let (colors, others) = image.values.split_at_mut(grid.pixels() * COLOR_CHANNELS);
-        grid::nhwc_from_nchw(grid, color.storage::<f32>(), colors);
-        power::positive_powers(isa, colors, GAMMA);
-        if let Some(layers) = layers.map(host) {
-            let grid = Grid {
-                batch: count,
-                ..grid
-            };
-            grid::nhwc_from_nchw(grid, layers.storage::<f32>(), others);
-        }
-        let mut scales = vec![image];
+        grid::nhwc_from_nchw(grid, layers.storage::<f32>(), others);
+    }
+    images
+}
+
+impl KernelHead {
+    /// The kernels that these convolutions, deepest level first, predict for images in linear light. The last
+    /// `layers` of them share the kernels of the first.
+    pub(super) fn new(isa: Isa, kernels: &[Conv2d], images: FeatureMaps, layers: usize) -> Self {
+        let mut scales = vec![images];
         for _ in 1..KERNEL_LEVELS {
             let above = &scales[scales.len() - 1];
             let mut image = FeatureMaps::new(above.grid.halved(), COLOR_CHANNELS);
             blend::halve(above.grid, &above.values, &mut image.values);
             scales.push(image);
         }
+        let kernels = kernels.iter().rev();
         KernelHead {
             isa,
             convs: kernels.map(|conv| FoldedConv::conv(conv, None)).collect(),
             scales,
-            layers: count,
+            layers,
             out: None,
         }
     }
@@ -115,6 +118,22 @@ impl KernelHead {
         filter::forward_rows(self.isa, grid, filter, rows, targets);
     }
 
+    /// Filters a level, if it has kernels, in bands of this many rows; `decoded` is the decoder's map.
+    pub(super) fn filter_level(&mut self, level: usize, decoded: &FeatureMaps, band: usize) {
+        if level >= KERNEL_LEVELS {
+            return;
+        }
+        let mut filtered = self.filtered(level);
+        let Grid { batch, height, .. } = decoded.grid;
+        for image in 0..batch {
+            for rows in bands(height, band) {
+                let decoded = decoded.rows(image, rows.clone());
+                self.filter_rows(level, image, rows, decoded, &mut filtered);
+            }
+        }
+        self.blend(filtered);
+    }
+
     /// Completes a level: blends the filtered image with the output so far.
     pub(super) fn blend(&mut self, filtered: FeatureMaps) {
         self.out = Some(match self.out.take() {
@@ -131,12 +150,17 @@ impl KernelHead {
         });
     }
 
+    /// The filtered images in linear light.
+    pub(super) fn into_images(self) -> FeatureMaps {
+        self.out.expect("all levels are filtered")
+    }
+
     /// The output in gamma space and the layers in linear light, planar.
     pub(super) fn finish(self) -> (Vec<f32>, Option<Vec<f32>>) {
-        let mut out = self.out.expect("all levels are filtered");
-        drop(self.scales);
-        let batch = out.grid.batch - self.layers;
-        let (colors, layers) = {
+        let (isa, layers) = (self.isa, self.layers);
+        let mut out = self.into_images();
+        let batch = out.grid.batch - layers;
+        let (colors, others) = {
             let image = out.grid.height * out.grid.width * COLOR_CHANNELS;
             out.values.split_at_mut(batch * image)
         };
@@ -145,31 +169,13 @@ impl KernelHead {
                 *value = 0.0;
             }
         });
-        power::positive_powers(self.isa, colors, 1.0 / GAMMA);
+        power::positive_powers(isa, colors, 1.0 / GAMMA);
         let planar = |batch: usize, values: &[f32]| {
             let mut planar = memory::buffer(values.len());
             grid::nchw_from_nhwc(Grid { batch, ..out.grid }, values, &mut planar);
             planar
         };
-        let filtered = (self.layers > 0).then(|| planar(self.layers, layers));
+        let filtered = (layers > 0).then(|| planar(layers, others));
         (planar(batch, colors), filtered)
-    }
-}
-
-impl InferencePass<'_> {
-    /// Filters a level, if it has kernels; `decoded` is the decoder's map.
-    pub(super) fn filter_level(&self, head: &mut KernelHead, level: usize, decoded: &FeatureMaps) {
-        if level >= KERNEL_LEVELS {
-            return;
-        }
-        let mut filtered = head.filtered(level);
-        let Grid { batch, height, .. } = decoded.grid;
-        for image in 0..batch {
-            for rows in bands(height, self.plan.band) {
-                let decoded = decoded.rows(image, rows.clone());
-                head.filter_rows(level, image, rows, decoded, &mut filtered);
-            }
-        }
-        head.blend(filtered);
     }
 }

@@ -23,6 +23,7 @@ mod folded;
 mod full_resolution;
 mod images;
 mod kernel_head;
+mod mixed_head;
 mod pass;
 #[cfg(test)]
 mod tests;
@@ -44,7 +45,7 @@ use encoder::{DEEPEST_BANDED, folded_block};
 use feature_maps::FeatureMaps;
 use full_resolution::{SkipSources, UPPER_LEVELS};
 use images::InputImages;
-use kernel_head::KernelHead;
+use kernel_head::{KernelHead, linear_images};
 use pass::{BandPlan, InferencePass};
 use watch::Watch;
 
@@ -85,7 +86,11 @@ fn forward_with(
     };
     let color = model.decoder.head.is_none().then(|| images.color());
     let encoded = pass.encode(images)?;
-    let head = color.map(|color| KernelHead::new(pass.isa, model, grid, &color, layers));
+    let head = color.map(|color| {
+        let images = linear_images(pass.isa, grid, &color, layers);
+        let layers = images.grid.batch - batch;
+        KernelHead::new(pass.isa, &model.decoder.kernels, images, layers)
+    });
     let (out, layers) = pass.decode(encoded, head)?;
     let tensor = |planes: Vec<f32>, images: usize| {
         let shape = [images, COLOR_CHANNELS, height, width];
@@ -155,7 +160,7 @@ impl InferencePass<'_> {
         for (index, (level, sum)) in levels.enumerate() {
             x = self.decode_level(level, &x, sum)?;
             if let Some(head) = &mut head {
-                self.filter_level(head, LEVELS - 1 - index, &x);
+                head.filter_level(LEVELS - 1 - index, &x, self.plan.band);
             }
         }
         match (sources, head) {

@@ -17,10 +17,12 @@ use super::feature_maps::FeatureMaps;
 use super::folded::FoldedConv;
 use super::full_resolution::write_rows;
 use super::images::host;
+use super::mixed_head::MixedPass;
 use super::pass::BandPlan;
 use super::watch::{Cancelled, Observer, Watch};
 use crate::config::{COLOR_CHANNELS, FEATURE_CHANNELS};
-use crate::unet::{UNET_LEVELS, Unet, UnetLevel};
+use crate::layers::ConvStack;
+use crate::unet::{UNET_LEVELS, Unet};
 
 /// As [`Unet::forward`], on the host without autodiff.
 pub(crate) fn forward(
@@ -113,6 +115,8 @@ impl UnetPass<'_> {
         let grid = input.grid;
         // The input of each encoder level but the first, which is the skip of the decoder's.
         let mut skips: Vec<FeatureMaps> = Vec::with_capacity(UNET_LEVELS);
+        let mixed = network.mixed.as_ref();
+        let mut mixed = mixed.map(|head| MixedPass::new(Isa::current(), head, grid, &input.color));
         for (level, module) in network.encoder.iter().enumerate() {
             let grid = (0..level).fold(grid, |grid, _| grid.halved());
             let convs = folded(module);
@@ -125,7 +129,10 @@ impl UnetPass<'_> {
                     None => input.interleave(image, rows, target),
                     Some(maps) => target.copy_from_slice(maps.rows(image, rows)),
                 },
-                |image, rows, values| {
+                |conv, image, rows, values| {
+                    if conv + 1 < convs.len() {
+                        return;
+                    }
                     let band = Grid {
                         batch: 1,
                         height: rows.len(),
@@ -147,7 +154,7 @@ impl UnetPass<'_> {
         )?;
         drop(deepest);
         let (last, upper) = network.decoder.split_last().expect("four levels");
-        for module in upper {
+        for (index, module) in upper.iter().enumerate() {
             let skip = skips.pop().expect("a skip for each level but the last");
             let below = x;
             x = self.level(&folded(module), skip.grid, |image, rows, target| {
@@ -160,8 +167,12 @@ impl UnetPass<'_> {
                     target,
                 );
             })?;
+            if let Some(mixed) = &mut mixed {
+                mixed.filter_level(UNET_LEVELS - 1 - index, &x, self.plan.band);
+            }
         }
         let mut convs = folded(last);
+        let head = convs.len();
         convs.push(FoldedConv::conv(&network.head, None));
         let mut planar = memory::buffer(grid.pixels() * COLOR_CHANNELS);
         let image_values = grid.height * grid.width * COLOR_CHANNELS;
@@ -173,11 +184,20 @@ impl UnetPass<'_> {
                 input.interleave(image, rows.clone(), &mut skip);
                 append(&x, image, rows, grid, &skip, target);
             },
-            |image, rows, values| {
-                let planar = &mut planar[image * image_values..][..image_values];
-                write_rows(planar, grid, rows, values);
+            |conv, image, rows, values| {
+                if conv == head {
+                    let planar = &mut planar[image * image_values..][..image_values];
+                    write_rows(planar, grid, rows, values);
+                } else if conv + 1 == head
+                    && let Some(mixed) = &mut mixed
+                {
+                    mixed.filter_rows(image, rows, values);
+                }
             },
         )?;
+        if let Some(mixed) = mixed {
+            mixed.blend(&mut planar);
+        }
         Ok(planar)
     }
 
@@ -190,20 +210,22 @@ impl UnetPass<'_> {
     ) -> Result<FeatureMaps, Cancelled> {
         let outputs = convs.last().expect("a convolution").outputs();
         let mut maps = FeatureMaps::new(grid, outputs);
-        self.run(convs, grid, fill, |image, rows, values| {
-            maps.rows_mut(image, rows).copy_from_slice(values);
+        self.run(convs, grid, fill, |conv, image, rows, values| {
+            if conv + 1 == convs.len() {
+                maps.rows_mut(image, rows).copy_from_slice(values);
+            }
         })?;
         Ok(maps)
     }
 
     /// Runs convolutions with ReLU on bands of maps on `grid`: `fill` writes rows of an image's input,
-    /// `take` gets rows of its output.
+    /// `take` gets the index of a convolution, and rows of its output for an image.
     fn run(
         &self,
         convs: &[FoldedConv],
         grid: Grid,
         mut fill: impl FnMut(usize, Range<usize>, &mut [f32]),
-        mut take: impl FnMut(usize, Range<usize>, &[f32]),
+        mut take: impl FnMut(usize, usize, Range<usize>, &[f32]),
     ) -> Result<(), Cancelled> {
         let banded = convs.iter().map(|conv| {
             let prepared = PreparedConvolution::new(Isa::current(), self.tile, conv.rectified());
@@ -225,12 +247,8 @@ impl UnetPass<'_> {
                 self.watch.add(rows.len() * grid.width)?;
                 let target = chain.input().push(rows.len());
                 fill(image, rows, target);
-                chain.advance(|_, _, _| ());
-                let range = chain.output.range();
-                if !range.is_empty() {
-                    take(image, range, chain.output.all().1);
-                    chain.output.free_all();
-                }
+                chain.advance(|conv, rows, values| take(conv, image, rows, values));
+                chain.output.free_all();
             }
         }
         Ok(())
@@ -255,7 +273,7 @@ fn append(
     double::forward(band, coarse, skip, target);
 }
 
-fn folded(level: &UnetLevel) -> Vec<FoldedConv> {
+fn folded(level: &ConvStack) -> Vec<FoldedConv> {
     let convs = level.convs.iter();
     convs.map(|conv| FoldedConv::conv(conv, None)).collect()
 }

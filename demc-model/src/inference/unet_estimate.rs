@@ -1,7 +1,7 @@
 //! Memory of a pass of a U-Net.
 
 use super::pass::{BandPlan, TILE_VALUES, VALUE, WAITING_ROWS};
-use crate::config::{COLOR_CHANNELS, FEATURE_CHANNELS, ModelConfig};
+use crate::config::{COLOR_CHANNELS, FEATURE_CHANNELS, Head, ModelConfig};
 use crate::unet::{UNET_LEVELS, UnetSpec};
 
 /// As [`peak_bytes`](super::peak_bytes), for a U-Net. Both sides are multiples of 16.
@@ -17,7 +17,12 @@ pub(super) fn unet_bytes(config: &ModelConfig, height: usize, width: usize) -> u
         width,
     };
     let images = estimate.map(0, COLOR_CHANNELS + FEATURE_CHANNELS);
-    ((images + estimate.largest_phase()) * VALUE) as u64
+    let head = match config.head {
+        // The noisy, the filtered, and the blended images of all scales, and the gate.
+        Head::Mixed => estimate.map(0, 4 * COLOR_CHANNELS + 1),
+        Head::Grey | Head::Xavier | Head::Kernel => 0,
+    };
+    ((images + head + estimate.largest_phase()) * VALUE) as u64
 }
 
 struct UnetEstimate {

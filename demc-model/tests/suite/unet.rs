@@ -1,20 +1,34 @@
 //! The U-Net: its inference against its modules, and what its guides do.
 
 use burn::tensor::{Device, Tensor};
+use demc_model::mixed_head::GATE_BIAS;
 use demc_model::unet::{Guides, UnetSize};
-use demc_model::{Denoiser, ModelConfig, Ops, Variant};
+use demc_model::{Denoiser, Head, ModelConfig, Ops, Variant, Weights};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-fn network(size: UnetSize, guides: Guides) -> Denoiser {
-    let config = ModelConfig {
+fn config(size: UnetSize, guides: Guides) -> ModelConfig {
+    ModelConfig {
         variant: Variant::Unet,
         size,
         guides,
         ..ModelConfig::default()
-    };
+    }
+}
+
+fn network(config: ModelConfig) -> Denoiser {
     let mut rng = ChaCha8Rng::seed_from_u64(3);
     config.init(&mut rng, [0.0; 3], &Device::flex())
+}
+
+/// The networks that start as a U-Net: a mixed head, and second encoders beside it.
+fn grown() -> [ModelConfig; 3] {
+    [Variant::Unet, Variant::UnetNosn, Variant::UnetDemc].map(|variant| ModelConfig {
+        variant,
+        width: 8,
+        head: Head::Mixed,
+        ..config(UnetSize::Small, Guides::AlbedoNormal)
+    })
 }
 
 fn noise(channels: usize, [batch, height, width]: [usize; 3]) -> Tensor<4> {
@@ -33,23 +47,76 @@ fn values(tensor: Tensor<4>) -> Vec<f32> {
 #[test]
 fn inference_agrees_with_burns_operations() {
     let cases = [
-        (UnetSize::Small, Guides::None, [2, 16, 48]),
-        (UnetSize::Base, Guides::Albedo, [1, 80, 32]),
-        (UnetSize::Base, Guides::AlbedoNormal, [1, 560, 1024]),
-        (UnetSize::Large, Guides::AlbedoNormal, [1, 32, 48]),
+        (config(UnetSize::Small, Guides::None), [2, 16, 48]),
+        (config(UnetSize::Base, Guides::Albedo), [1, 80, 32]),
+        (config(UnetSize::Base, Guides::AlbedoNormal), [1, 560, 1024]),
+        (config(UnetSize::Large, Guides::AlbedoNormal), [1, 32, 48]),
     ];
-    for (size, guides, shape) in cases {
+    let others = grown().into_iter().map(|config| (config, [2, 96, 64]));
+    let banded = grown().into_iter().take(1);
+    let banded = banded.map(|config| (config, [1, 560, 1024]));
+    for (config, shape) in cases.into_iter().chain(others).chain(banded) {
         let (color, features) = (noise(3, shape), noise(12, shape));
         let [found, expected] = Ops::ALL.map(|ops| {
-            let model = network(size, guides).with_ops(ops);
+            let model = moved(&network(config)).with_ops(ops);
             values(model.forward(color.clone(), features.clone()))
         });
         let largest = expected.iter().fold(0.0f32, |m, x| m.max(*x));
-        assert!(largest > 0.1, "{size:?}: black");
+        assert!(largest > 0.1, "{config}: black");
         for (found, expected) in found.iter().zip(&expected) {
             let difference = (found - expected).abs() / largest;
-            assert!(difference < 5e-5, "{size:?}: {found} {expected}");
+            assert!(difference < 5e-5, "{config}: {found} {expected}");
         }
+    }
+}
+
+/// A network whose biases are not 0, so that gates and fusions are not where they start.
+fn moved(model: &Denoiser) -> Denoiser {
+    let mut weights = model.weights();
+    for (index, weight) in weights.iter_mut().enumerate() {
+        if weight.name.ends_with("bias") {
+            let values = weight.data.iter_mut().zip(index..);
+            values.for_each(|(value, i)| *value += 0.05 * (i as f32).sin());
+        }
+    }
+    let loaded = model
+        .config()
+        .load(&mut Weights::new(weights), &Device::flex());
+    loaded.expect("its own weights")
+}
+
+/// A second encoder adds nothing before the first step; a mixed head adds 12 % of a blurred image.
+#[test]
+fn a_grown_network_starts_as_its_trunk() {
+    let shape = [1, 32, 48];
+    let (color, features) = (noise(3, shape), noise(12, shape));
+    let outputs = grown().map(|config| {
+        let trunk = network(config.trunk().expect("a U-Net"));
+        let whole = network(config);
+        let mut weights = whole.weights();
+        for weight in &mut weights {
+            let own = trunk.weights().into_iter();
+            if let Some(own) = own.into_iter().find(|own| own.name == weight.name) {
+                *weight = own;
+            }
+        }
+        let whole = config.load(&mut Weights::new(weights), &Device::flex());
+        let whole = whole.expect("its own weights");
+        [whole, trunk].map(|model| {
+            values(
+                model
+                    .with_ops(Ops::Burn)
+                    .forward(color.clone(), features.clone()),
+            )
+        })
+    });
+    let share = 1.0 / (1.0 + (-GATE_BIAS).exp());
+    for [whole, trunk] in &outputs {
+        assert_eq!(whole, &outputs[0][0], "second encoders differ");
+        let blurred = |whole: f32, trunk: f32| trunk + (whole - trunk) / share;
+        let range = whole.iter().zip(trunk).map(|(w, t)| blurred(*w, *t));
+        assert!(range.clone().all(|value| (-0.2..=2.2).contains(&value)));
+        assert!(range.fold(0.0, f32::max) > 0.1);
     }
 }
 
@@ -63,7 +130,7 @@ fn only_the_guides_count() {
         (Guides::Albedo, vec![6, 7, 8]),
         (Guides::AlbedoNormal, vec![0, 1, 2, 6, 7, 8]),
     ] {
-        let model = network(UnetSize::Small, guides);
+        let model = network(config(UnetSize::Small, guides));
         let with = |channel: Option<usize>| {
             let mut planes: Vec<Tensor<4>> = noise(12, shape).split(1, 1);
             if let Some(channel) = channel {

@@ -43,6 +43,9 @@ pub struct OptimizerConfig {
     /// Share of every kernel that a step at learning rate 1 removes (decoupled weight decay,
     /// Loshchilov and Hutter 2019). Paper: none.
     pub weight_decay: f64,
+    /// Factor of the learning rate for the U-Net's own weights, beside those of a mixed head and of a
+    /// second encoder. Paper: none.
+    pub trunk_rate: f64,
     /// Learning rate of the first step.
     pub lr_start: f64,
     /// Learning rate at the end of the run.
@@ -64,6 +67,7 @@ impl Default for OptimizerConfig {
             kind: OptimizerKind::Adam,
             muon_max_rows: None,
             weight_decay: 0.0,
+            trunk_rate: 1.0,
             lr_start: LR_START,
             lr_end: LR_END,
             lr_decay: LrDecay::Exponential,
@@ -88,6 +92,12 @@ impl OptimizerConfig {
             "weight_decay",
             &decay,
             &format!("from 0 to {MAX_DECAY}"),
+        );
+        problems.require(
+            (0.0..=1.0).contains(&self.trunk_rate),
+            "trunk_rate",
+            &self.trunk_rate,
+            "from 0 to 1",
         );
         if let Some(norm) = self.max_grad_norm {
             let holds = norm.is_finite() && norm > 0.0;

@@ -26,8 +26,8 @@ pub struct TrainConfig {
     /// and `demc-infer` use the averaged weights. Absent: no average, as in the paper.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ema_decay: Option<f64>,
-    /// Initial weights: a run directory, a checkpoint or an exported file with the same `[model]`
-    /// and `data.gamma`. Absent: random initialisation from `seed`.
+    /// Initial weights: a run directory, a checkpoint or an exported file with the same `[model]`, or of
+    /// the U-Net in it, and the same `data.gamma`. Absent: random initialisation from `seed`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub init: Option<PathBuf>,
     /// Reaction to a non-finite loss or gradient.

@@ -1,12 +1,13 @@
 //! The network before its first step: random, or the weights of `train.init`.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use anyhow::{Context, bail, ensure};
 use burn::tensor::Device;
 use demc_data::input::ranges::Ranges;
 use demc_infer::bundle::{Bundle, BundleFile, Bundled};
-use demc_model::{Denoiser, ModelConfig};
+use demc_model::{Denoiser, ModelConfig, Weight, Weights};
 use demc_program::checksum::{sha256, sha256_of};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -113,11 +114,32 @@ pub fn initial_network(
         albedo_filter,
         ..
     } = file.into_bundle(device).context("train.init")?;
+    let model = if *model.config() == config.model {
+        model
+    } else {
+        let seed = config.train.seed;
+        grown(
+            &model,
+            random_network(&config.model, seed, flat_color, device),
+            device,
+        )
+    };
     Ok(InitialNetwork {
         model,
         albedo_filter,
         weights: Some(weights),
     })
+}
+
+/// `whole` with the weights of `trunk`, a part of it.
+fn grown(trunk: &Denoiser, whole: Denoiser, device: &Device) -> Denoiser {
+    let mut weights: BTreeMap<String, Weight> = BTreeMap::new();
+    for weight in whole.weights().into_iter().chain(trunk.weights()) {
+        weights.insert(weight.name.clone(), weight);
+    }
+    let mut weights = Weights::new(weights.into_values().collect());
+    let grown = whole.config().load(&mut weights, device);
+    grown.expect("a trunk has weights of the whole")
 }
 
 /// The file of `train.init`, if it is set.
@@ -133,6 +155,7 @@ pub fn read_init(config: &Config) -> anyhow::Result<Option<BundleFile>> {
     let mut saved = config.clone();
     // Its own initialisation does not matter.
     let theirs = file.meta.model.head;
+    let grows = config.model.trunk() == Some(file.meta.model);
     saved.model = ModelConfig {
         head: if theirs.has_weights_of(config.model.head) {
             config.model.head
@@ -142,6 +165,9 @@ pub fn read_init(config: &Config) -> anyhow::Result<Option<BundleFile>> {
         detail: config.model.detail,
         ..file.meta.model
     };
+    if grows {
+        saved.model = config.model;
+    }
     saved.data.gamma = file.meta.normalizer.gamma;
     saved.data.transfer = file.meta.normalizer.transfer;
     let differences = config.differences(&saved);

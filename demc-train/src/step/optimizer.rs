@@ -4,14 +4,14 @@
 //! by the names of the weights: Burn's whole-module optimizer restores state on a default device,
 //! which may not exist on this machine.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use burn::module::{Module, ModuleMapper, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_model::ops::muon;
 use demc_model::ops::update::{AdamConstants, AdamMoments};
-use demc_model::{Denoiser, Ops, Role, Stage, Weight, WeightSpec};
+use demc_model::{Denoiser, ModelConfig, Ops, Role, Stage, Weight, WeightSpec};
 
 use crate::config::Config;
 
@@ -40,6 +40,10 @@ pub struct Optimizer {
     /// Rows up to which Muon updates a kernel; `None` with Adam alone.
     muon_rows: Option<usize>,
     weight_decay: f64,
+    /// Factor of the rate for the weights of `trunk`.
+    trunk_rate: f64,
+    /// The names of a U-Net's own weights, if the network has others.
+    trunk: BTreeSet<String>,
     steps: u64,
     /// Every weight of the network, in module order.
     specs: Vec<WeightSpec>,
@@ -94,10 +98,14 @@ impl Optimizer {
             beta_2: BETA_2,
             epsilon: EPSILON,
         };
+        let trunk = config.model.trunk().filter(|trunk| *trunk != config.model);
+        let trunk = trunk.iter().flat_map(ModelConfig::weight_specs);
         Optimizer {
             constants,
             muon_rows: config.optimizer.muon_rows(),
             weight_decay: config.optimizer.weight_decay,
+            trunk_rate: config.optimizer.trunk_rate,
+            trunk: trunk.map(|spec| spec.name).collect(),
             steps: 0,
             specs: config.model.weight_specs(),
             states: BTreeMap::new(),
@@ -264,15 +272,21 @@ impl ModuleMapper for OptimizerStep<'_> {
         let optimizer = &mut *self.optimizer;
         let state = optimizer.states.remove(&spec.name);
         let mut weight = tensor.inner();
+        let factor = if optimizer.trunk.contains(&spec.name) {
+            optimizer.trunk_rate
+        } else {
+            1.0
+        };
+        let lr = factor * self.lr;
         if optimizer.weight_decay > 0.0 && spec.rows().is_some() {
-            weight = weight.mul_scalar(1.0 - self.lr * optimizer.weight_decay);
+            weight = weight.mul_scalar(1.0 - lr * optimizer.weight_decay);
         }
         let (stepped, state) = if optimizer.is_for_muon(spec) {
             let velocity = match state {
                 Some(WeightState::Muon(velocity)) => Some(velocity),
                 _ => None,
             };
-            let (stepped, velocity) = muon::step(spec, self.lr, weight, grad, velocity);
+            let (stepped, velocity) = muon::step(spec, lr, weight, grad, velocity);
             (stepped, WeightState::Muon(velocity))
         } else {
             let moments = match state {
@@ -282,7 +296,7 @@ impl ModuleMapper for OptimizerStep<'_> {
             let (stepped, moments) =
                 optimizer
                     .constants
-                    .step(self.ops, self.lr, optimizer.steps, weight, grad, moments);
+                    .step(self.ops, lr, optimizer.steps, weight, grad, moments);
             (stepped, WeightState::Adam(moments))
         };
         optimizer.states.insert(spec.name.clone(), state);

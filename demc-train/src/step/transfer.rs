@@ -2,12 +2,8 @@
 
 use burn::tensor::Tensor;
 use demc_data::Transfer;
-use demc_data::input::pu;
 use demc_model::kernel_head::DARKEST;
-
-/// Values above this many times the curve's peak have no gradient; their radiance nears the largest
-/// float.
-const BRIGHTEST: f32 = 2.0;
+use demc_model::pu;
 
 /// An output, compressed by `transfer`, in gamma space. Below `DARKEST` it has no gradient under
 /// [`Transfer::Pu`].
@@ -17,23 +13,10 @@ const BRIGHTEST: f32 = 2.0;
 pub fn in_gamma(out: Tensor<4>, transfer: Transfer, gamma: f32) -> Tensor<4> {
     match transfer {
         Transfer::Gamma => out,
-        Transfer::Pu => radiance_from_pu(out)
+        Transfer::Pu => pu::radiance(out)
             .clamp_min(DARKEST)
             .powf_scalar(1.0 / gamma),
     }
-}
-
-/// See [`pu::inverse`]. Each part has a gradient for its own values only.
-fn radiance_from_pu(out: Tensor<4>) -> Tensor<4> {
-    let peak = pu::value(pu::PEAK);
-    let x = out.mul_scalar(peak).clamp(0.0, BRIGHTEST * peak);
-    let middle = (x.clone().clamp(pu::X0, pu::X1) - pu::D) / pu::B;
-    let middle = middle.powf_scalar(1.0 / pu::C);
-    let bright = ((x.clone().clamp_min(pu::X1) - pu::G) / pu::E).exp() - pu::F;
-    let is_bright = x.clone().detach().greater_elem(pu::X1);
-    let is_dark = x.clone().detach().lower_equal_elem(pu::X0);
-    let radiance = middle.mask_where(is_bright, bright);
-    radiance.mask_where(is_dark, x / pu::A)
 }
 
 #[cfg(test)]

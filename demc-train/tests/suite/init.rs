@@ -1,5 +1,6 @@
 //! Runs that start from the weights of another: `train.init`.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -10,6 +11,7 @@ use crate::common::{
 use burn::tensor::Device;
 use demc_infer::Bundle;
 use demc_infer::bundle::{Names, Precision};
+use demc_model::mixed_head::GATE_BIAS;
 use demc_program::checksum::sha256_of;
 
 /// The best weights of a run without running statistics, which change at any learning rate.
@@ -83,6 +85,50 @@ fn a_run_starts_from_the_weights_of_another() {
     assert_same(&first, &third);
     fs::remove_dir_all(&first).expect("the test's own");
     trained(&config, &third, &[&seeded[..], &["--resume"]].concat());
+}
+
+/// The paper's second encoder and a mixed head beside a trained U-Net, which `trunk_rate = 0` keeps.
+#[test]
+fn a_network_grows_from_its_trunk() {
+    let dir = tempfile::tempdir().expect("a temporary directory");
+    let config = config(dir.path());
+    let path = |name: &str| dir.path().join(name);
+    let (trunk, grown) = (path("trunk"), path("grown"));
+    let unet = [
+        "--set=model.variant=unet",
+        "--set=model.size=small",
+        "--set=model.width=",
+        "--set=model.reading=",
+        "--set=data.transfer=pu",
+        "--set=data.exposure_level=0.18",
+        "--set=train.ema_decay=",
+        "--set=train.steps=2",
+    ];
+    trained(&config, &trunk, &unet);
+    let init = format!("--set=train.init={}", trunk.display());
+    let more = [
+        "--set=model.variant=unet-demc",
+        "--set=model.width=4",
+        "--set=model.head=mixed",
+        "--set=optimizer.trunk_rate=0.0",
+        &init,
+    ];
+    trained(&config, &grown, &[&unet[..], &more].concat());
+    let own: BTreeMap<_, _> = weights(&trunk).into_iter().collect();
+    let whole = weights(&grown);
+    let kept = whole.iter().filter(|(name, _)| own.contains_key(name));
+    assert_eq!(kept.clone().count(), own.len());
+    for (name, values) in kept {
+        assert_eq!(values, &own[name], "{name}");
+    }
+    let gate = whole.iter().find(|(name, _)| name == "mixed.gate.bias");
+    let [moved] = gate.expect("a gate").1[..] else {
+        panic!("one value");
+    };
+    assert!(
+        moved != GATE_BIAS && (moved - GATE_BIAS).abs() < 0.1,
+        "{moved}"
+    );
 }
 
 #[test]

@@ -8,7 +8,7 @@ use std::fs;
 use std::path::Path;
 
 use crate::live::{
-    FEATURES, Python, random_bundle, random_kpcn, random_unet, read_floats, uniform, write_floats,
+    FEATURES, Python, random_bundle, random_kpcn, random_unets, read_floats, uniform, write_floats,
 };
 use crate::tensors::{Tolerance, assert_close};
 use burn::tensor::Device;
@@ -89,7 +89,8 @@ fn onnx_runtime_computes_what_this_program_does() {
         compare(folder, name, bundle, &frames, seed);
     }
     let file = folder.join("network.onnx");
-    for bundle in [random_kpcn(&mut rng), random_unet(&mut rng)] {
+    let kpcn = random_kpcn(&mut rng);
+    for bundle in random_unets(&mut rng).into_iter().chain([kpcn]) {
         for (precision, _) in PRECISIONS {
             bundle.export_onnx(&file, precision).expect("exported");
             let expected = bundle.rounded(precision).expect("rounded");

@@ -8,8 +8,10 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-use crate::live::{FEATURES, Python, random_bundle, random_kpcn, random_unet, uniform};
+use crate::fixture::{gradients_by_name, is_bias_before_norm};
+use crate::live::{FEATURES, Python, random_bundle, random_kpcn, random_unets, uniform};
 use crate::tensors::{Tolerance, assert_close, read};
+use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_infer::verify::{Deviation, Runtime, verify};
 use demc_infer::{Bundle, Names, Precision};
@@ -44,7 +46,8 @@ fn pytorch_loads_every_export_strictly_and_agrees() {
         }
     }
     let mut rng = ChaCha8Rng::seed_from_u64(rand::random());
-    for bundle in [random_kpcn(&mut rng), random_unet(&mut rng)] {
+    let kpcn = random_kpcn(&mut rng);
+    for bundle in random_unets(&mut rng).into_iter().chain([kpcn]) {
         let file = tempfile::NamedTempFile::new().expect("a file");
         let saved = bundle.save(file.path(), Names::Torch, Precision::F32);
         saved.expect("the bundle is written");
@@ -65,6 +68,60 @@ fn pytorch_loads_every_export_strictly_and_agrees() {
         Names::Torch,
         Precision::F16,
     );
+}
+
+/// Share of a tensor's largest gradient, in float32 on both sides. Measured: 2e-5.
+const GRADIENT: Tolerance = Tolerance {
+    absolute: 1e-9,
+    of_largest: 1e-3,
+    of_value: 0.0,
+};
+
+/// The networks that grow from a U-Net have no fixture, whose weights would be large.
+#[test]
+fn pytorch_has_the_gradients_of_every_unet() {
+    let Some(python) = Python::with(
+        "torch, demc",
+        "'./bindings/python[torch]'",
+        "DEMC_REQUIRE_TORCH",
+    ) else {
+        return;
+    };
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("torch/gradients.py");
+    let device = Device::flex().autodiff();
+    let mut rng = ChaCha8Rng::seed_from_u64(11);
+    for bundle in random_unets(&mut rng) {
+        let folder = TempDir::new().expect("a temporary directory");
+        let [file, input, output] = ["bundle", "input", "output"]
+            .map(|name| folder.path().join(name).with_extension("safetensors"));
+        bundle
+            .save(&file, Names::Torch, Precision::F32)
+            .expect("saved");
+        let [batch, colors, height, width] = SHAPE;
+        let color = uniform(0.0, 0.5, batch * colors * height * width, &mut rng);
+        let features = uniform(-1.0, 1.0, batch * FEATURES * height * width, &mut rng);
+        write_input(&input, &color, &features);
+        python.succeed(&[&script, &file, &input, &output]);
+        let theirs = read(&output);
+
+        let tensor = |values, channels| {
+            let data = TensorData::new(values, [batch, channels, height, width]);
+            Tensor::<4>::from_data(data, &device)
+        };
+        let model = Bundle::load(&file, &device).expect("its own").model;
+        let out = model.forward(tensor(color, colors), tensor(features, FEATURES));
+        let loss = (out.clone() * out).mean();
+        let gradients = GradientsParams::from_grads(loss.backward(), &model);
+        let found = gradients_by_name(&model, &gradients);
+        assert_eq!(found.len(), theirs.len(), "{}", model.config());
+        for (name, found) in &found {
+            let theirs = &theirs[&name.replace("gamma", "weight").replace("beta", "bias")];
+            if !is_bias_before_norm(name.trim_start_matches("side."), Reading::Paper) {
+                let what = format!("{}: {name}", model.config());
+                assert_close(&what, found, &theirs.data, GRADIENT);
+            }
+        }
+    }
 }
 
 fn agrees(python: &Python, variant: Variant, reading: Reading, names: Names, precision: Precision) {

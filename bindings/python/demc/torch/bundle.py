@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from . import light, preprocess, transfer
-from .config import KPCN, UNET, ModelConfig
+from .config import KPCN, UNETS, ModelConfig
 from .kpcn import Kpcn
 from .metrics import gamma_from_hdr
 from .network import Denoiser
@@ -100,6 +100,8 @@ class Bundle:
         A layer whose name ends in R, G, or B is divided by that channel of the albedo as the colour
         is. Other layers, such as alpha, are not. Layers are neither scaled nor clamped.
         """
+        if not isinstance(self.model, Denoiser):
+            raise ValueError(f'layers need a model with head "kernel"; this one is {self.model.config}')
         inputs, modulation = self._inputs(color, features)
         albedo = torch.cat((modulation[0] ** self.gamma, torch.ones_like(modulation[0, :1])))
         albedo = albedo[[layer_color(name) for name in layers]]
@@ -267,7 +269,7 @@ def _network(path: str | os.PathLike, meta: Any, weights: dict[str, Tensor], *pa
     demodulate = meta["normalizer"].get("demodulate", 0.0)
     mean, std = (torch.tensor(entry("normalizer", "features", key)) for key in ("mean", "std"))
     config = ModelConfig(**entry("model"))
-    model = {KPCN: Kpcn, UNET: Unet}.get(config.variant, Denoiser)(config)
+    model = ({KPCN: Kpcn} | dict.fromkeys(UNETS, Unet)).get(config.variant, Denoiser)(config)
     try:
         model.load_state_dict(weights, strict=True)
     except RuntimeError as error:

@@ -30,8 +30,8 @@ VARIANTS = {
 }
 KPCN = "kpcn"
 """The networks of `kpcn.Kpcn`."""
-UNET = "unet"
-"""The network of `unet.Unet`."""
+UNETS = {"unet": None, "unet-demc": "detail", "unet-nosn": "features"}
+"""The variants of `unet.Unet`, and what their second encoder takes."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ READINGS = {
 class ModelConfig:
     """The `model` part of a bundle's metadata.
 
-    `head` "kernel" predicts kernels (`kernel_head`). "grey" and "xavier", and `detail`, are initialisations.
+    `head` "kernel" predicts kernels (`kernel_head`), "mixed" blends their image with a U-Net's. "grey" and "xavier", and
+    `detail`, are initialisations.
     """
 
     variant: str = "demc"
@@ -69,9 +70,9 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         for what, value, known in (
-            ("variant", self.variant, (*VARIANTS, KPCN, UNET)),
+            ("variant", self.variant, (*VARIANTS, KPCN, *UNETS)),
             ("reading", self.reading, READINGS),
-            ("head", self.head, ("grey", "xavier", "kernel")),
+            ("head", self.head, ("grey", "xavier", "kernel", "mixed")),
             ("detail", self.detail, ("open", "xavier")),
             ("size", self.size, ("small", "base", "large")),
             ("guides", self.guides, ("none", "albedo", "albedo-normal")),
@@ -93,7 +94,7 @@ class ModelConfig:
         """A short name; includes the levels if they are not the paper's."""
         if self.variant == KPCN:
             return f"{self.variant}, width {self.width}"
-        if self.variant == UNET:
+        if self.variant in UNETS:
             return f"{self.variant}, {self.size}"
         levels = "" if self.levels == LEVEL_FACTORS else f", levels of {self.level_channels}"
         return f"{self.variant}, {self.reading} reading, width {self.width}{levels}"

@@ -27,7 +27,7 @@ BN_MOMENTUM = 0.01
 OPEN_BIAS = 1.0
 """Initial bias of the detail map's last convolution if `detail` is "open" (ours)."""
 GREY_HEAD_SCALE = 0.1
-"""Factor of the head's Xavier weights if `head` is "grey" or "kernel" (ours)."""
+"""Factor of the head's Xavier weights if `head` is "grey" or "kernel", and of a mixed head's new ones (ours)."""
 KERNEL_LEVELS = 4
 """Levels at which a kernel head filters, from the full resolution down."""
 KERNEL_TAPS = 25
@@ -186,9 +186,7 @@ class Decoder(nn.Module):
         self.levels = nn.ModuleList(DecoderLevel(a, b, encoders, reading) for a, b in zip(widths, widths[1:]))
         self.head, self.kernels = None, nn.ModuleList()
         if head == "kernel":
-            for level in reversed(range(KERNEL_LEVELS)):
-                logits = KERNEL_TAPS + (level + 1 < KERNEL_LEVELS)
-                self.kernels.append(nn.Conv2d(levels[level], logits, 1))
+            self.kernels = kernel_convolutions(levels)
         else:
             self.head = nn.Conv2d(levels[0], 3, reading.head_kernel, padding="same")
 
@@ -209,6 +207,12 @@ class Decoder(nn.Module):
         return kernel_head(logits, color_gamma, layers)
 
 
+def kernel_convolutions(channels: Sequence[int]) -> nn.ModuleList:
+    """The convolutions to logits, the deepest first; `channels` of the maps, from the full resolution down."""
+    levels = reversed(range(KERNEL_LEVELS))
+    return nn.ModuleList(nn.Conv2d(channels[i], KERNEL_TAPS + (i + 1 < KERNEL_LEVELS), 1) for i in levels)
+
+
 def kernel_head(
     logits: Sequence[Tensor], color_gamma: Tensor, layers: Tensor | None = None
 ) -> tuple[Tensor, Tensor | None]:
@@ -219,7 +223,15 @@ def kernel_head(
     filter `layers`, [L, 3, H, W] in linear light.
     """
     color = color_gamma.detach().clamp_min(0) ** KERNEL_GAMMA
-    images = [color if layers is None else torch.cat((color, layers))]
+    out = filtered_on_all_scales(logits, color if layers is None else torch.cat((color, layers)))
+    out, others = out.split((len(color), len(out) - len(color)))
+    denoised = out.clamp_min(DARKEST) ** (1 / KERNEL_GAMMA) * (out > DARKEST)
+    return denoised, None if layers is None else others
+
+
+def filtered_on_all_scales(logits: Sequence[Tensor], images: Tensor) -> Tensor:
+    """Images [B, 3, H, W] in linear light, filtered with the kernels of `kernel_head`."""
+    images = [images]
     for _ in logits[1:]:
         images.append(F.avg_pool2d(images[-1], 2))
     out = None
@@ -229,9 +241,7 @@ def kernel_head(
             correction = F.interpolate(out - F.avg_pool2d(fine, 2), scale_factor=2, mode="bilinear")
             fine = fine + level_logits[:, KERNEL_TAPS:].sigmoid() * correction
         out = fine
-    out, others = out.split((len(color), len(out) - len(color)))
-    denoised = out.clamp_min(DARKEST) ** (1 / KERNEL_GAMMA) * (out > DARKEST)
-    return denoised, None if layers is None else others
+    return out
 
 
 def filtered(image: Tensor, kernels: Tensor) -> Tensor:

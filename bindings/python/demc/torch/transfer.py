@@ -19,13 +19,23 @@ def compress(color_hdr: Tensor, normalizer: dict) -> Tensor:
     """Linear radiance -> the network's colour, before albedo demodulation."""
     if normalizer.get("transfer", "gamma") == "gamma":
         return gamma_from_hdr(color_hdr, normalizer["gamma"])
-    return pu(color_hdr.clamp_min(0)) / pu(torch.tensor(PEAK))
+    return compress_pu(color_hdr)
 
 
 def expand(color: Tensor, normalizer: dict) -> Tensor:
     """The network's colour, after albedo modulation -> linear radiance."""
     if normalizer.get("transfer", "gamma") == "gamma":
         return hdr_from_gamma(color, normalizer["gamma"])
+    return expand_pu(color)
+
+
+def compress_pu(color_hdr: Tensor) -> Tensor:
+    """Linear radiance -> OIDN's colour, 1 at the peak."""
+    return pu(color_hdr.clamp_min(0)) / pu(torch.tensor(PEAK))
+
+
+def expand_pu(color: Tensor) -> Tensor:
+    """OIDN's colour -> linear radiance."""
     x = color.clamp_min(0) * pu(torch.tensor(PEAK))
     middle = ((x.clamp(X0, X1) - D) / B) ** (1 / C)
     bright = torch.exp((x.clamp_min(X1) - G) / E) - F

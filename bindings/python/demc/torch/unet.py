@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from .config import ModelConfig
+from .config import UNETS, ModelConfig
+from .network import (
+    CHANNELS,
+    GREY_HEAD_SCALE,
+    KERNEL_LEVELS,
+    OPEN_BIAS,
+    Fusion,
+    filtered_on_all_scales,
+    kernel_convolutions,
+)
+from .transfer import compress_pu, expand_pu
 
 SIZES = {
     "small": (((32, 32), (32,), (32,), (32,)), (32, 32), ((64, 64), (64, 64), (64, 32), (32, 32))),
@@ -16,6 +28,10 @@ SIZES = {
 """Output channels of the convolutions: encoder from the full resolution down, bottom, decoder from the deepest up."""
 GUIDES = {"none": (), "albedo": (6,), "albedo-normal": (6, 0)}
 """The first feature channel of each guide, in the order of the network's input."""
+SIDE_WIDTHS = (1, 2, 4, 4)
+"""Channels of the second encoder's levels as multiples of the width, from the full resolution down."""
+GATE_BIAS = -2.0
+"""Initial bias of a mixed head's gate: 12 % of the filtered image."""
 HALVINGS = 4
 """Heights and widths must be multiples of 2 to this power."""
 
@@ -33,8 +49,47 @@ class Level(nn.Module):
         return x
 
 
+class MixedHead(nn.Module):
+    """Blends the U-Net's image with the noisy colour, filtered with predicted kernels."""
+
+    def __init__(self, channels: Sequence[int]) -> None:
+        """`channels` of the decoder's levels, from the full resolution down."""
+        super().__init__()
+        self.kernels = kernel_convolutions(channels)
+        self.gate = nn.Conv2d(channels[0], 1, 1)
+
+    def forward(self, direct: Tensor, decoded: Sequence[Tensor], color: Tensor) -> Tensor:
+        """`direct` and `color` [B, 3, H, W], and the decoder's maps, the deepest first -> [B, 3, H, W]."""
+        logits = [conv(x) for conv, x in zip(self.kernels, decoded[-KERNEL_LEVELS:])]
+        filtered = compress_pu(filtered_on_all_scales(logits, expand_pu(color.detach())))
+        return torch.lerp(direct, filtered, self.gate(decoded[-1]).sigmoid())
+
+
+class SideEncoder(nn.Module):
+    """An encoder of the features, or of their detail map, whose maps are added to those of the decoder."""
+
+    def __init__(self, source: str, width: int, decoder: Sequence[int]) -> None:
+        """`source` is "features" or "detail"; `decoder` has its channels, from the full resolution down."""
+        super().__init__()
+        self.fusion = Fusion(width) if source == "detail" else None
+        channels = [width * factor for factor in SIDE_WIDTHS]
+        inputs = (CHANNELS[source], *channels)
+        self.levels = nn.ModuleList(Level(a, (b, b)) for a, b in zip(inputs, channels))
+        sides = reversed(list(zip(decoder, channels)))
+        self.fuses = nn.ModuleList(nn.Conv2d(own + side, own, 1) for own, side in sides)
+
+    def forward(self, features: Tensor) -> list[Tensor]:
+        """[B, 12, H, W] -> the maps, from the full resolution down."""
+        x = features if self.fusion is None else self.fusion(features)
+        maps = []
+        for level in self.levels:
+            x = level(F.max_pool2d(x, 2) if maps else x)
+            maps.append(x)
+        return maps
+
+
 class Unet(nn.Module):
-    """The network: the input is the last skip."""
+    """The network: the input is the last skip. `UNETS` says what the encoder beside it takes, if it has one."""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
@@ -55,19 +110,42 @@ class Unet(nn.Module):
             self.decoder.append(Level(channels + skip, outputs))
             channels = outputs[-1]
         self.head = nn.Conv2d(channels, 3, 3, padding=1)
+        decoded = [outputs[-1] for outputs in reversed(decoder)]
+        source = UNETS[config.variant]
+        self.mixed = MixedHead(decoded) if config.head == "mixed" else None
+        self.side = SideEncoder(source, config.width, decoded) if source else None
+        self._initialise()
+
+    @torch.no_grad()
+    def _initialise(self) -> None:
         for conv in self.modules():
             if isinstance(conv, nn.Conv2d):
                 nn.init.xavier_uniform_(conv.weight)
                 nn.init.zeros_(conv.bias)
+        if self.mixed is not None:
+            for conv in (*self.mixed.kernels, self.mixed.gate):
+                conv.weight.mul_(GREY_HEAD_SCALE)
+            self.mixed.gate.bias.fill_(GATE_BIAS)
+        if self.side is not None:
+            for conv in self.side.fuses:
+                nn.init.zeros_(conv.weight)
+                nn.init.eye_(conv.weight[: len(conv.weight), : len(conv.weight), 0, 0])
+            if self.side.fusion is not None:
+                self.side.fusion.blocks[-1].conv.bias.fill_(OPEN_BIAS)
 
     def forward(self, color: Tensor, features: Tensor) -> Tensor:
         """Colour [B, 3, H, W] and features [B, 12, H, W], both in OIDN's value ranges -> [B, 3, H, W], not negative."""
         x = torch.cat((color, *(features[:, first : first + 3] for first in self.guides)), 1)
-        skips = []
+        side = None if self.side is None else self.side(features)
+        skips, decoded = [], []
         for level in self.encoder:
             skips.append(x)
             x = F.max_pool2d(level(x), 2)
         x = self.bottom(x)
-        for level in self.decoder:
+        for index, level in enumerate(self.decoder):
             x = level(torch.cat((F.interpolate(x, scale_factor=2, mode="nearest"), skips.pop()), 1))
-        return F.relu(self.head(x))
+            if side is not None:
+                x = F.relu(self.side.fuses[index](torch.cat((x, side.pop()), 1)))
+            decoded.append(x)
+        direct = F.relu(self.head(x))
+        return direct if self.mixed is None else self.mixed(direct, decoded, color)

@@ -1,0 +1,55 @@
+//! The mixed head of a U-Net: its own image and the noisy colour filtered with predicted kernels, blended
+//! by a gate.
+//!
+//! - `direct`: the U-Net's image.
+//! - `filtered`: the image of a [kernel head](crate::kernel_head) on the decoder's maps.
+//! - The output is `(1 - g) direct + g filtered`, all in the network's space. g is the sigmoid of a 1x1
+//!   convolution of the decoder's last map.
+//!
+//! The gate starts at [`GATE_BIAS`], so the network starts near the U-Net's image.
+
+use burn::module::Module;
+use burn::nn::conv::Conv2d;
+
+use crate::init::{GREY_HEAD_SCALE, Init};
+use crate::kernel_head;
+use crate::layers::conv;
+use crate::ops::Maps;
+use crate::weights::{Builder, Stage, WeightsError};
+
+/// Initial bias of the gate: 12 % of the filtered image. From 50 %, the gate closed within 500 steps.
+pub const GATE_BIAS: f32 = -2.0;
+
+/// The convolutions to kernels and to the gate.
+#[derive(Module, Debug)]
+pub struct MixedHead {
+    /// The convolutions to kernels, deepest level first.
+    pub kernels: Vec<Conv2d>,
+    /// The convolution to the gate.
+    pub gate: Conv2d,
+}
+
+impl MixedHead {
+    /// `channels`: those of the decoder's levels, from the full resolution down.
+    pub(crate) fn build(b: &mut Builder, channels: &[usize]) -> Result<Self, WeightsError> {
+        let kernels = kernel_head::build(b, channels)?;
+        b.enter(Stage::Head { level: 0 });
+        let gate = b.part("gate", |b| {
+            let weight = Init::Xavier(GREY_HEAD_SCALE);
+            conv(b, [channels[0], 1], 1, weight, Init::Filled(GATE_BIAS))
+        })?;
+        Ok(MixedHead { kernels, gate })
+    }
+
+    /// The blended image.
+    ///
+    /// # Shapes
+    /// `direct` and the noisy `color` `[B, 3, H, W]` in the network's space; `decoded`: the decoder's maps,
+    /// deepest first. Returns the shape of `direct`.
+    pub fn forward(&self, direct: Maps, decoded: Vec<Maps>, color: Maps) -> Maps {
+        let last = decoded.last().expect("a decoder has levels").clone();
+        let gate = last.conv1x1(&self.gate).sigmoid();
+        let filtered = kernel_head::filtered(&self.kernels, decoded, color.pu_radiance());
+        direct.mix(filtered.pu_color(), gate)
+    }
+}
