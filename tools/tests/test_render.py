@@ -16,12 +16,11 @@ FOLDER = Path(__file__).resolve().parents[1] / "render"
 MISSING = [name for name in ("numpy", "OpenEXR", "mitsuba") if importlib.util.find_spec(name) is None]
 SIDE, SAMPLES = 32, 1024
 SHARED = {
-    *("Stage.__init__", "Stage.tint", "Stage.paint", "Stage.material", "Stage.any_material", "color", "noise", "tiled"),
-    *("Stage.add", "Stage.box", "Stage.rod", "Stage.ball", "Stage.turned", "Stage.mesh", "environment", "square_film"),
+    *("color", "noise", "environment"),
     *("Room.__init__", "Room.shell", "Room.ceiling", "Room.pictures", "Room.furnish", "Room.blacken", "Room.camera"),
     *("Still.__init__", "Still.ground", "Still.surface", "Still.arrange", "Still.darken", "Still.camera"),
 }
-"""What draws training scenes and the scenes of the held-out set."""
+"""What draws training scenes and the scenes of the held-out set, beside the materials, shapes, and lights of `stage.py`."""
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess:
@@ -419,7 +418,8 @@ class Render(unittest.TestCase):
             names: set[str] = set()
 
             def note(frame, event: str, _) -> None:
-                if event == "call" and Path(frame.f_code.co_filename).parent == FOLDER:
+                file = Path(frame.f_code.co_filename)
+                if event == "call" and file.parent == FOLDER and file.name != "stage.py":
                     names.add(frame.f_code.co_qualname.partition(".<locals>")[0])
 
             sys.setprofile(note)
