@@ -117,8 +117,8 @@ impl Unet {
     /// Denoises colour with guides, both in OIDN's value ranges.
     ///
     /// # Shapes
-    /// `color` `[B, 3, H, W]`; `features` `[B, 12, H, W]`, of which albedo and normal count; H and W
-    /// multiples of 16. Returns the shape of `color`, not negative.
+    /// `color` `[B, 3, H, W]`; `features` `[B, 12, H, W]`, of which the guides count, with a second encoder
+    /// all; H and W multiples of 16. Returns the shape of `color`, not negative.
     pub fn forward(&self, color: Tensor<4>, features: Tensor<4>, ops: Ops) -> Tensor<4> {
         let noisy = self
             .mixed

@@ -277,7 +277,7 @@ impl Bundle {
     /// [`OidnError::NotUnet`], [`OidnError::AlbedoFilter`].
     fn to_tza(&self) -> Result<Vec<u8>, OidnError> {
         let model = &self.meta.model;
-        if model.variant != Variant::Unet || self.meta.normalizer.transfer != Transfer::Pu {
+        if model.trunk() != Some(*model) || self.meta.normalizer.transfer != Transfer::Pu {
             let model = model.to_string();
             return Err(OidnError::NotUnet { model });
         }
@@ -310,7 +310,8 @@ fn normalizer() -> Normalizer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bundle::testing::{bundle, filtered};
+    use crate::bundle::testing::{bundle, bundle_with, filtered};
+    use demc_model::Head;
 
     fn unet() -> Bundle {
         let mut unet = bundle(Variant::Unet);
@@ -341,6 +342,8 @@ mod tests {
         let error = |bundle: &Bundle| bundle.export_tza(&path).expect_err("refused");
         let other = error(&bundle(Variant::Semc));
         assert!(matches!(other, OidnError::NotUnet { .. }), "{other}");
+        let mixed = error(&bundle_with(Variant::Unet, Head::Mixed));
+        assert!(matches!(mixed, OidnError::NotUnet { .. }), "{mixed}");
         let gamma = error(&bundle(Variant::Unet));
         assert!(matches!(gamma, OidnError::NotUnet { .. }), "{gamma}");
         let mut filter = filtered(Variant::Unet, Variant::Demc);
