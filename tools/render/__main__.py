@@ -108,7 +108,7 @@ def render(args: argparse.Namespace) -> None:
             rng = np.random.default_rng([base.seed, view, 7])
             counts = drawn_counts(args, rng)
             files = {count: name if args.spp == [count] else f"{name}-{count}spp" for count in counts}
-            wanted[name] = files, views.Traits.draw(rng, args.traits)
+            wanted[name] = files, views.Traits.draw(rng, args.traits, args.moving)
         missing = [
             name for name, (files, _) in wanted.items()
             if name in own and name not in known and not all((folder / f"{file}.exr").exists() for file in files.values())
@@ -250,6 +250,7 @@ def arguments() -> list[argparse.Namespace]:
     parser.add_argument("--spp", type=numbers, default=[4], metavar="N,...", help="samples per pixel of the noisy images [4]")
     parser.add_argument("--counts", type=int, metavar="N", help="largest number of noisy images per view, drawn from --spp [all]")
     parser.add_argument("--traits", type=float, default=0.0, metavar="SHARE", help="share of the views with a Gaussian pixel filter, with albedo behind glass, and with another exposure, each [0]")
+    parser.add_argument("--moving", type=float, default=0.0, metavar="SHARE", help="share of the views that a moving camera blurs [0]")
     parser.add_argument("--passes", choices=("paper",), help="also write what the paper's comparison needs: half buffers, variances, depth, diffuse and specular parts")
     parser.add_argument("--ref-spp", type=int, default=128, metavar="N", help="largest number of samples per pixel of the reference [128]")
     parser.add_argument("--residual", type=float, default=0.03, metavar="X", help="expected RelMSE at which a reference is good enough [0.03]")

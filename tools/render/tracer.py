@@ -69,11 +69,13 @@ def render(
     view: int = 0,
     follow: bool = False,
     passes: bool = False,
+    motion: np.ndarray | None = None,
 ) -> Samples:
     """Traces `samples` paths per pixel of sensor number `view`: box filter, independent sampler.
 
     `clamp` limits the radiance of a sample, without emitters seen directly. With `follow`, albedo is that of
-    the first surface behind mirrors and clear glass, as Blender Cycles and LuxCore write it.
+    the first surface behind mirrors and clear glass, as Blender Cycles and LuxCore write it. `motion` is the way
+    of the camera during the exposure, `[3]` in scene units.
     """
     sensor = scene.sensors()[view]
     width, height = (int(side) for side in sensor.film().crop_size())
@@ -81,7 +83,8 @@ def render(
     sums, done = None, 0
     while done < samples:
         count = min(at_once, samples - done)
-        traced = trace_pixels(scene, sensor, width, height, count, seed + done, clamp, follow, passes)
+        ways = follow, passes, motion
+        traced = trace_pixels(scene, sensor, (width, height, count), seed + done, clamp, *ways)
         sums = traced if sums is None else {name: sums[name] + traced[name] for name in sums}
         done += count
     shaped = {name: plane.reshape(height, width, -1) for name, plane in sums.items()}
@@ -90,9 +93,10 @@ def render(
 
 
 def trace_pixels(
-    scene, sensor, width: int, height: int, count: int, seed: int, clamp: float, follow: bool, passes: bool
+    scene, sensor, shape: tuple[int, int, int], seed: int, clamp: float, follow: bool, passes: bool, motion
 ) -> dict[str, np.ndarray]:
     """Sums over `count` paths of each pixel, `[H * W, C]` float64; `NAME^2` is the sum of squares."""
+    width, height, count = shape
     paths = width * height * count
     sampler = mi.load_dict({"type": "independent"})
     # Mitsuba hashes seed and index: neighbouring seeds are not correlated.
@@ -102,6 +106,10 @@ def trace_pixels(
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
     film = (corner + sampler.next_2d()) / mi.ScalarPoint2f(width, height)
     ray, weight = sensor.sample_ray(0.0, sampler.next_1d(), film, sampler.next_2d())
+    if motion is not None:
+        # In the middle of the exposure, the camera is where the scene puts it.
+        way = mi.Vector3f(*(dr.opaque(mi.Float, float(part)) for part in motion))
+        ray.o += way * (sampler.next_1d() - 0.5)
     limit = dr.opaque(mi.Float, min(clamp, 1e30))
     color, features, (depth, diffuse) = trace(scene, sampler, ray, limit, dr.opaque(mi.Bool, follow), passes)
 

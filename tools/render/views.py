@@ -26,6 +26,8 @@ PROBE_SAMPLES = 8
 """Samples per pixel for measuring the mean."""
 ROUND_SAMPLES = 16
 """Samples per pixel of one round of the reference. Rounds alternate between two halves."""
+MOTION = (0.003, 0.04)
+"""Shortest and longest way of a moving camera, as shares of the median distance."""
 EPSILON = 0.001
 """Epsilon of RelMSE (Eq. 5)."""
 USUAL = 4
@@ -82,13 +84,19 @@ class Traits:
     """Albedo is that of the surface behind mirrors and clear glass (`tracer.render`)."""
     exposure: float = 1.0
     """Factor on colour and reference."""
+    motion: tuple[float, ...] = ()
+    """The way of the camera during the exposure, as shares of the median distance; empty: it rests."""
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, share: float) -> Traits:
-        """Each trait with probability `share`."""
+    def draw(cls, rng: np.random.Generator, share: float, moving: float = 0.0) -> Traits:
+        """Each trait with probability `share`, a moving camera with probability `moving`."""
         has = rng.random(3) < share
         sigma, stops = rng.uniform(0.35, 0.75), rng.uniform(-10, 10)
-        return cls(float(has[0] * sigma), bool(has[1]), float(2.0 ** (has[2] * stops)))
+        motion = np.empty(0)
+        if rng.random() < moving:
+            way = rng.normal(size=3)
+            motion = way / np.linalg.norm(way) * np.exp(rng.uniform(*np.log(MOTION)))
+        return cls(float(has[0] * sigma), bool(has[1]), float(2.0 ** (has[2] * stops)), tuple(motion.tolist()))
 
 
 def photograph(
@@ -109,14 +117,15 @@ def photograph(
     if np.quantile(distance, 0.3) < budget.near:
         raise Unsuitable("blocked")
     scale, clamp = LUMINANCE / mean, CLAMP * mean
+    motion = np.median(distance) * np.array(traits.motion) if traits.motion else None
 
-    images = noisy_images(scene, view, seed, (scale, clamp), sorted(counts), traits, passes)
+    images = noisy_images(scene, view, seed, (scale, clamp), sorted(counts), traits, passes, motion)
     halves, count, others = [0.0, 0.0], 0, dict.fromkeys((*GUIDES, *(PARTS if passes else ())), 0.0)
     largest = max(budget.ref_samples, REFERENCE_SHARE * max(counts))
     while True:
         for half in range(2):
             start = seed + 100 + count + ROUND_SAMPLES * half
-            traced = tracer.render(scene, ROUND_SAMPLES, start, clamp, view, traits.follow, passes)
+            traced = tracer.render(scene, ROUND_SAMPLES, start, clamp, view, traits.follow, passes, motion)
             halves[half] = halves[half] + traced.color / traced.count
             others = {name: total + traced.features[name] for name, total in others.items()}
         count += 2 * ROUND_SAMPLES
@@ -156,6 +165,8 @@ def photograph(
         }
         if traits != Traits():
             facts |= {"pixel_filter_sigma": traits.pixel_filter, "albedo_behind_glass": traits.follow}
+        if traits.motion:
+            facts["camera_motion"] = list(traits.motion)
         if passes:
             facts["passes"] = "paper"
         found.append((channels, facts))
@@ -163,11 +174,11 @@ def photograph(
 
 
 def noisy_images(
-    scene, view: int, seed: int, limits: tuple[float, float], counts: list[int], traits: Traits, passes: bool
+    scene, view: int, seed: int, limits: tuple[float, float], counts: list[int], traits: Traits, passes: bool, motion
 ) -> list[tuple[int, dict[str, np.ndarray]]]:
     """The number of samples per pixel and the buffers of each noisy image, `[H, W, C]` each.
 
-    `limits` are the factor on radiance, and the limit of a sample.
+    `limits` are the factor on radiance, and the limit of a sample. `motion` is that of `tracer.render`.
     """
     scale, clamp = limits
     images, halves = [], [None] * (2 if passes else 1)
@@ -176,7 +187,7 @@ def noisy_images(
         # Seeds that neither the reference nor other views use.
         start = seed + 10 if count <= FEW and not images else seed + MANY + count
         for i, half in enumerate(halves):
-            traced = tracer.render(scene, added, start + i * added, clamp, view, traits.follow, passes)
+            traced = tracer.render(scene, added, start + i * added, clamp, view, traits.follow, passes, motion)
             halves[i] = traced.plus(half)
         noisy = halves[0].plus(halves[1] if passes else None)
         factor = lambda name: scale if name in ("color", *PARTS) else 1.0

@@ -380,13 +380,30 @@ class Render(unittest.TestCase):
         wall = np.s_[8:16, 1:4]
         np.testing.assert_array_equal(plain["albedo1"][wall], behind["albedo1"][wall])
 
+    def test_a_moving_camera_gives_the_mean_over_its_way(self) -> None:
+        import numpy as np
+        import tracer
+        from variant import mi
+
+        def albedo(at: float, motion: np.ndarray | None = None) -> np.ndarray:
+            scene = self.scene()
+            scene["sensor"]["to_world"] = mi.ScalarTransform4f().translate([at, 0, 0]) @ scene["sensor"]["to_world"]
+            return tracer.render(mi.load_dict(scene), 64, 1000, motion=motion).mean("albedo1")
+
+        way = 0.6
+        blurred, still = albedo(0, np.array([way, 0, 0])), albedo(0)
+        mean = np.mean([albedo(way * ((step + 0.5) / 16 - 0.5)) for step in range(16)], axis=0)
+        far = np.abs(still - mean).mean()
+        self.assertGreater(far, 0.01)
+        self.assertLess(np.abs(blurred - mean).mean(), 0.3 * far)
+
     def test_each_view_has_its_own_counts_and_traits(self) -> None:
         import numpy as np
         import views
 
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder)
-            ask = ("--preset", "train", "--rooms", 0, "--stills", 4, "--views", 1, "--size", 32, "--ref-spp", 64, "--spp", "1,2,4,16", "--traits", 1)
+            ask = ("--preset", "train", "--rooms", 0, "--stills", 4, "--views", 1, "--size", 32, "--ref-spp", 64, "--spp", "1,2,4,16", "--traits", 1, "--moving", 1)
             ended = run("-o", out, *ask)
             self.assertEqual(ended.returncode, 0, ended.stderr)
             scenes = json.loads((out / "manifest.json").read_text())["scenes"]
@@ -399,6 +416,7 @@ class Render(unittest.TestCase):
             for scene in scenes:
                 self.assertEqual(scene["repeat"], 2 if scene["spp"] == 16 else 1)
                 self.assertTrue(0.35 <= scene["pixel_filter_sigma"] <= 0.75 and scene["albedo_behind_glass"])
+                self.assertTrue(0.003 <= np.linalg.norm(scene["camera_motion"]) <= 0.04)
         # The noise of neighbouring pixels is correlated, and the mean stays.
         noise = np.random.default_rng(1).standard_normal((64, 64, 3))
         wide = views.filtered(noise, 0.5)
