@@ -49,3 +49,21 @@ pub fn inverse(value: f32) -> f32 {
         ((value - G) / E).exp() - F
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_parts_meet_and_each_comes_back() {
+        for (radiance, joint) in [(Y0, X0), (Y1, X1)] {
+            for side in [0.9999, 1.0, 1.0001] {
+                assert!((value(side * radiance) / joint - 1.0).abs() < 1e-3);
+                assert!((inverse(side * joint) / radiance - 1.0).abs() < 1e-3);
+            }
+        }
+        for radiance in [0.0, 1e-7, 1e-4, 0.02, 0.5, 900.0, PEAK] {
+            assert!((inverse(value(radiance)) - radiance).abs() <= 1e-4 * radiance);
+        }
+    }
+}

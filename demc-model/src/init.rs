@@ -38,7 +38,7 @@ impl Init {
     /// The values of a tensor of this shape, row-major.
     ///
     /// # Shapes
-    /// `[out, in, h, w]` for `Xavier` and `IdentitySum`, `[in, out, 4, 4]` for `Bilinear`, `[3]`
+    /// `[out, in, h, w]` for `Xavier` and both identities, `[in, out, 4, 4]` for `Bilinear`, `[3]`
     /// for `Color`.
     ///
     /// # Panics
@@ -50,7 +50,15 @@ impl Init {
             Init::Ones => vec![1.0; len],
             Init::Xavier(scale) => xavier(shape, scale, rng),
             Init::Bilinear => bilinear(shape),
-            Init::IdentitySum => identity_blocks(shape, usize::MAX),
+            Init::IdentitySum => {
+                let [out, input, ..] = four(shape);
+                assert_eq!(
+                    input % out,
+                    0,
+                    "a skip fusion has a multiple of its outputs as inputs"
+                );
+                identity_blocks(shape, input / out)
+            }
             Init::IdentityFirst => identity_blocks(shape, 1),
             Init::Filled(value) => vec![value; len],
             Init::Color(values) => {
@@ -87,11 +95,10 @@ fn bilinear(shape: &[usize]) -> Vec<f32> {
     weight
 }
 
-/// `[I I ... I]`: identity blocks side by side (Eq. 3), at most `blocks`; zero elsewhere.
+/// `[I I ... 0]`: so many identity blocks side by side (Eq. 3), zero elsewhere.
 fn identity_blocks(shape: &[usize], blocks: usize) -> Vec<f32> {
     let [out, input, height, width] = four(shape);
     assert_eq!([height, width], [1, 1], "a skip fusion is 1x1");
-    let blocks = blocks.min(input / out);
     let mut weight = vec![0.0; out * input];
     for row in 0..out {
         for block in 0..blocks {
@@ -124,6 +131,13 @@ mod tests {
         // The mean of 4608 uniform values has a deviation of bound / sqrt(3 * 4608) = 0.0085 bound.
         // The tolerance is 5 deviations.
         assert!(mean.abs() < 0.043 * bound, "mean {mean}");
+    }
+
+    #[test]
+    fn the_first_input_of_a_fusion_may_count_alone() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let weights = Init::IdentityFirst.values(&[2, 3, 1, 1], &mut rng);
+        assert_eq!(weights, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
     }
 
     #[test]

@@ -53,3 +53,44 @@ impl MixedHead {
         direct.mix(filtered.pu_color(), gate)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::{Device, Tensor};
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use crate::unet::UnetSize;
+    use crate::{Head, ModelConfig, Ops, Variant, Weights};
+
+    /// The image of a small network with this bias of the gate, for a flat colour.
+    fn image(bias: f32, head: Head) -> Vec<f32> {
+        let config = ModelConfig {
+            variant: Variant::Unet,
+            size: UnetSize::Small,
+            head,
+            ..ModelConfig::default()
+        };
+        let device = Device::flex();
+        let mut weights = config
+            .init(&mut ChaCha8Rng::seed_from_u64(2), [0.0; 3], &device)
+            .weights();
+        let gate = weights.iter_mut().find(|w| w.name == "mixed.gate.bias");
+        gate.into_iter().for_each(|gate| gate.data[0] = bias);
+        let network = config.load(&mut Weights::new(weights), &device);
+        let images = [3, 12].map(|channels| Tensor::full([1, channels, 16, 16], 0.4, &device));
+        let [color, features] = images;
+        let network = network.expect("its own weights").with_ops(Ops::Burn);
+        let out = network.forward(color, features).into_data();
+        out.try_to_vec().expect("float32")
+    }
+
+    #[test]
+    fn a_closed_gate_leaves_the_direct_image_and_an_open_one_the_filtered() {
+        assert_eq!(image(-200.0, Head::Mixed), image(0.0, Head::Grey));
+        // Kernels keep a flat image.
+        for value in image(200.0, Head::Mixed) {
+            assert!((value - 0.4).abs() < 1e-5, "{value}");
+        }
+    }
+}

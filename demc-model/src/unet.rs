@@ -120,15 +120,11 @@ impl Unet {
     /// `color` `[B, 3, H, W]`; `features` `[B, 12, H, W]`, of which the guides count, with a second encoder
     /// all; H and W multiples of 16. Returns the shape of `color`, not negative.
     pub fn forward(&self, color: Tensor<4>, features: Tensor<4>, ops: Ops) -> Tensor<4> {
-        let noisy = self
-            .mixed
-            .as_ref()
-            .map(|_| Maps::from_nchw(color.clone(), ops));
         let side = self
             .side
             .as_ref()
             .map(|side| (side, side.forward(Maps::from_nchw(features.clone(), ops))));
-        let mut inputs = vec![color];
+        let mut inputs = vec![color.clone()];
         for first in self.guides.first_channels() {
             inputs.push(features.clone().narrow(1, *first, COLOR_CHANNELS));
         }
@@ -149,9 +145,10 @@ impl Unet {
             decoded.push(x.clone());
         }
         let direct = x.conv3x3(&self.head, Activation::Relu);
-        match (&self.mixed, noisy) {
-            (Some(mixed), Some(noisy)) => mixed.forward(direct, decoded, noisy).into_nchw(),
-            _ => direct.into_nchw(),
-        }
+        let out = match &self.mixed {
+            Some(mixed) => mixed.forward(direct, decoded, Maps::from_nchw(color, ops)),
+            None => direct,
+        };
+        out.into_nchw()
     }
 }

@@ -83,8 +83,7 @@ def render(
     sums, done = None, 0
     while done < samples:
         count = min(at_once, samples - done)
-        ways = follow, passes, motion
-        traced = trace_pixels(scene, sensor, (width, height, count), seed + done, clamp, *ways)
+        traced = trace_pixels(scene, sensor, count, seed + done, clamp, follow, passes, motion)
         sums = traced if sums is None else {name: sums[name] + traced[name] for name in sums}
         done += count
     shaped = {name: plane.reshape(height, width, -1) for name, plane in sums.items()}
@@ -93,10 +92,10 @@ def render(
 
 
 def trace_pixels(
-    scene, sensor, shape: tuple[int, int, int], seed: int, clamp: float, follow: bool, passes: bool, motion
+    scene, sensor, count: int, seed: int, clamp: float, follow: bool, passes: bool, motion: np.ndarray | None
 ) -> dict[str, np.ndarray]:
     """Sums over `count` paths of each pixel, `[H * W, C]` float64; `NAME^2` is the sum of squares."""
-    width, height, count = shape
+    width, height = (int(side) for side in sensor.film().crop_size())
     paths = width * height * count
     sampler = mi.load_dict({"type": "independent"})
     # Mitsuba hashes seed and index: neighbouring seeds are not correlated.

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -119,13 +121,16 @@ def photograph(
     scale, clamp = LUMINANCE / mean, CLAMP * mean
     motion = np.median(distance) * np.array(traits.motion) if traits.motion else None
 
-    images = noisy_images(scene, view, seed, (scale, clamp), sorted(counts), traits, passes, motion)
+    ways = {"clamp": clamp, "view": view, "follow": traits.follow, "passes": passes, "motion": motion}
+    trace = partial(tracer.render, scene, **ways)
+
+    images = noisy_images(trace, seed, scale, sorted(counts), traits.pixel_filter, passes)
     halves, count, others = [0.0, 0.0], 0, dict.fromkeys((*GUIDES, *(PARTS if passes else ())), 0.0)
     largest = max(budget.ref_samples, REFERENCE_SHARE * max(counts))
     while True:
         for half in range(2):
             start = seed + 100 + count + ROUND_SAMPLES * half
-            traced = tracer.render(scene, ROUND_SAMPLES, start, clamp, view, traits.follow, passes, motion)
+            traced = trace(ROUND_SAMPLES, start)
             halves[half] = halves[half] + traced.color / traced.count
             others = {name: total + traced.features[name] for name, total in others.items()}
         count += 2 * ROUND_SAMPLES
@@ -174,20 +179,19 @@ def photograph(
 
 
 def noisy_images(
-    scene, view: int, seed: int, limits: tuple[float, float], counts: list[int], traits: Traits, passes: bool, motion
+    trace: Callable, seed: int, scale: float, counts: list[int], pixel_filter: float, passes: bool
 ) -> list[tuple[int, dict[str, np.ndarray]]]:
     """The number of samples per pixel and the buffers of each noisy image, `[H, W, C]` each.
 
-    `limits` are the factor on radiance, and the limit of a sample. `motion` is that of `tracer.render`.
+    `trace` traces a number of samples from a seed; `scale` is the factor on radiance.
     """
-    scale, clamp = limits
     images, halves = [], [None] * (2 if passes else 1)
     for count in counts:
         added = (count - sum(half.count for half in halves if half)) // len(halves)
         # Seeds that neither the reference nor other views use.
         start = seed + 10 if count <= FEW and not images else seed + MANY + count
         for i, half in enumerate(halves):
-            traced = tracer.render(scene, added, start + i * added, clamp, view, traits.follow, passes, motion)
+            traced = trace(added, start + i * added)
             halves[i] = traced.plus(half)
         noisy = halves[0].plus(halves[1] if passes else None)
         factor = lambda name: scale if name in ("color", *PARTS) else 1.0
@@ -196,7 +200,7 @@ def noisy_images(
             buffers[f"variance.{name}"] = noisy.variance(name) * factor(name) ** 2
         for i, half in enumerate(halves):
             buffers |= {f"half{i + 1}.{name}": half.mean(name) * factor(name) for name in HALVES if passes}
-        images.append((count, {name: filtered(planes, traits.pixel_filter) for name, planes in buffers.items()}))
+        images.append((count, {name: filtered(planes, pixel_filter) for name, planes in buffers.items()}))
     return images
 
 

@@ -6,6 +6,9 @@ use demc_kernels::pu::{self, A, B, C, D, E, F, G, PEAK, X0, X1, Y0, Y1};
 use super::graph::{GraphBuilder, Value};
 use super::network::{COLOR, OUTPUT};
 
+/// Name of the radiance of at least 0 that [`GraphBuilder::compressed`] begins with.
+pub(super) const POSITIVE_COLOR: &str = "color_positive";
+
 impl GraphBuilder {
     /// The network's colour: radiance of at least 0, compressed, divided by the modulation.
     pub(super) fn compressed(
@@ -13,7 +16,7 @@ impl GraphBuilder {
         normalizer: &Normalizer,
         modulation: Option<&Value>,
     ) -> Value {
-        let positive = self.node("Relu", "color_positive", &[&Value(COLOR.into())], &[]);
+        let positive = self.node("Relu", POSITIVE_COLOR, &[&Value(COLOR.into())], &[]);
         let color = match normalizer.transfer {
             Transfer::Gamma => {
                 let exponent = self.constant("inverse_gamma", &[], &[1.0 / normalizer.gamma]);

@@ -8,6 +8,7 @@ use demc_model::side_encoder::SideEncoder;
 use demc_model::unet::Unet;
 
 use super::graph::{AttributeValue, GraphBuilder, Value};
+use super::transfer::POSITIVE_COLOR;
 
 impl GraphBuilder {
     pub(super) fn unet(&mut self, network: &Unet, normalizer: &Normalizer) {
@@ -75,7 +76,7 @@ impl GraphBuilder {
 
     /// The U-Net's image blended with the filtered one (`demc_model::mixed_head`).
     fn mixed(&mut self, head: &MixedHead, direct: &Value, decoded: &[Value]) -> Value {
-        let noisy = Value("color_positive".into());
+        let noisy = Value(POSITIVE_COLOR.into());
         let filtered = self.filtered_on_all_scales(&head.kernels, decoded, noisy);
         let filtered = self.node("Relu", "mixed.positive", &[&filtered], &[]);
         let filtered = self.pu("mixed", &filtered);

@@ -155,19 +155,19 @@ pub fn read_init(config: &Config) -> anyhow::Result<Option<BundleFile>> {
     let mut saved = config.clone();
     // Its own initialisation does not matter.
     let theirs = file.meta.model.head;
-    let grows = config.model.trunk() == Some(file.meta.model);
-    saved.model = ModelConfig {
-        head: if theirs.has_weights_of(config.model.head) {
-            config.model.head
-        } else {
-            theirs
-        },
-        detail: config.model.detail,
-        ..file.meta.model
+    saved.model = if config.model.trunk() == Some(file.meta.model) {
+        config.model
+    } else {
+        ModelConfig {
+            head: if theirs.has_weights_of(config.model.head) {
+                config.model.head
+            } else {
+                theirs
+            },
+            detail: config.model.detail,
+            ..file.meta.model
+        }
     };
-    if grows {
-        saved.model = config.model;
-    }
     saved.data.gamma = file.meta.normalizer.gamma;
     saved.data.transfer = file.meta.normalizer.transfer;
     let differences = config.differences(&saved);

@@ -31,13 +31,15 @@ const OUTPUT: Tolerance = Tolerance {
     of_value: 0.0,
 };
 
+/// A Python with PyTorch and the package of `bindings/python/`.
+fn pytorch() -> Option<Python> {
+    let install = "'./bindings/python[torch]'";
+    Python::with("torch, demc", install, "DEMC_REQUIRE_TORCH")
+}
+
 #[test]
 fn pytorch_loads_every_export_strictly_and_agrees() {
-    let Some(python) = Python::with(
-        "torch, demc",
-        "'./bindings/python[torch]'",
-        "DEMC_REQUIRE_TORCH",
-    ) else {
+    let Some(python) = pytorch() else {
         return;
     };
     for variant in Variant::with_encoders() {
@@ -80,11 +82,7 @@ const GRADIENT: Tolerance = Tolerance {
 /// The networks that grow from a U-Net have no fixture, whose weights would be large.
 #[test]
 fn pytorch_has_the_gradients_of_every_unet() {
-    let Some(python) = Python::with(
-        "torch, demc",
-        "'./bindings/python[torch]'",
-        "DEMC_REQUIRE_TORCH",
-    ) else {
+    let Some(python) = pytorch() else {
         return;
     };
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("torch/gradients.py");
