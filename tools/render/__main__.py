@@ -9,7 +9,9 @@
     python tools/render -o data/rooms --rooms 60 --passes paper      what NFOR and KPCN need (docs/data.md#passes)
     python tools/render -o data/rooms --rooms 60 --shard 1/4         a part, on a farm (docs/farms.md)
     python tools/render -o data/bundled --preset train               the training data of the bundled models
+    python tools/render -o data/bundled --preset train-kinds         more of it, of kinds that are hard to denoise
     python tools/render -o data/heldout --preset heldout             their test scenes
+    python tools/render -o data/heldout-2 --preset heldout-2         their test scenes, second edition
     python tools/render -o data/comparison --preset comparison       the scenes of the paper's comparison
 
 Existing images are kept: rerun a command to resume it. Mitsuba needs LLVM's shared library (Debian:
@@ -19,8 +21,6 @@ libllvm19); DRJIT_LIBLLVM_PATH names it if Mitsuba does not find it.
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -35,22 +35,18 @@ from rooms import Room
 from stills import Still
 from variant import mi
 
-from demc.torch.files import write_json, write_text  # `views` puts the package on the path.
+from demc.torch.files import write_text  # `views` puts the packages on the path.
 from demc.torch.shard import add_shard_flag
+from rendered import COUNTS, HELD_OUT, LEFT_OUT, TEST, Unsuitable, add_flags, drawn_counts, left_out, repeat, write, write_manifest
 
+RENDERER = f"Mitsuba {mi.__version__}"
 NOISE = (0.2, 16.0)
 """Range of RelMSE of a room's noisy image. Views outside it are left out."""
 STILL_NOISE = (0.03, 16.0)
 """The same for a still life. Its cleaner images teach the network to keep textures."""
-LEFT_OUT = ".left-out"
-"""Ending of the file that has the reason why a view was left out."""
 NEAR, STILL_NEAR = 0.5, 0.15
 """Smallest distance of a view, in metres, in rooms and still lifes (`Budget.near`)."""
 
-
-COUNTS = [1, 2, 4, 8, 16, 32, 64, 128, 256]
-REPEATS = {16: 2, 64: 6}
-"""How often an epoch takes the images of at least so many samples per pixel: with --counts, they are few."""
 EDITIONS = {
     "train": (Room, Still),
     "heldout": (ReservedRoom, ReservedStill),
@@ -59,12 +55,18 @@ EDITIONS = {
 }
 """The rooms and still lifes of `--edition`."""
 TRAINING = {"rooms": 680, "stills": 380, "size": 192, "spp": COUNTS, "counts": 3, "traits": 0.25, "seed": 29}
-TEST = {"views": 1, "size": 192, "residual": 0.0, "split": "test"}
-HELD_OUT = TEST | {"rooms": 78, "stills": 20, "spp": COUNTS[::2], "ref_spp": 2048, "edition": "heldout", "seed": 1029}
 COMPARISON = {"edition": "comparison", "passes": "paper"}
 PRESETS = {
     "train": [TRAINING],
-    "heldout": [HELD_OUT],
+    "train-kinds": [
+        {"kind": kind, "stills": 60, "size": 192, "spp": COUNTS, "counts": 3, "traits": 0.25, "moving": 0.15, "seed": 5029 + 100 * number}
+        for number, kind in enumerate(KINDS)
+    ],
+    "heldout": [HELD_OUT | {"rooms": 78, "stills": 20, "seed": 1029}],
+    "heldout-2": [
+        HELD_OUT | {"rooms": 60, "stills": 10, "moving": 0.15, "seed": 6029},
+        *(HELD_OUT | {"kind": kind, "stills": 6, "seed": 6129 + 100 * number} for number, kind in enumerate(KINDS)),
+    ],
     "comparison": [
         COMPARISON | {"rooms": 170, "stills": 80, "size": 192, "seed": 2029},
         COMPARISON | TEST | {"rooms": 110, "stills": 40, "ref_spp": 1024, "seed": 3029},
@@ -95,7 +97,7 @@ def render(args: argparse.Namespace) -> None:
     folder = args.output / args.split
     folder.mkdir(parents=True, exist_ok=True)
     budget = views.Budget(args.ref_spp, args.residual)
-    known = left_out(args)
+    known = left_out(args.output)
     rooms = made(args, "room", args.rooms, furnished_room, 0, replace(budget, noise=NOISE, near=NEAR))
     stills = made(args, "still", args.stills, still_life, 50000, replace(budget, noise=STILL_NOISE, near=STILL_NEAR))
     bases = [*own_scenes(args, budget), *rooms, *stills]
@@ -127,31 +129,16 @@ def render(args: argparse.Namespace) -> None:
                     if args.kind:
                         place["kind"] = args.kind
                     if args.counts:
-                        place["repeat"] = max((times for least, times in REPEATS.items() if facts["spp"] >= least), default=1)
-                    views.write(folder / f"{file}.exr", channels, place | facts)
+                        place["repeat"] = repeat(facts["spp"])
+                    write(folder / f"{file}.exr", channels, place | facts)
                     said.append("RelMSE {noisy_relmse:.2f} at {spp} spp".format(**facts))
                 said = f"{', '.join(said)}, reference {facts['ref_residual_relmse']:.4f} at {facts['ref_spp']} spp"
-            except views.Unsuitable as reason:
+            except Unsuitable as reason:
                 write_text(folder / f"{name}{LEFT_OUT}", str(reason))
                 said = f"left out: {reason}"
-            write_manifest(args)
+            write_manifest(args, RENDERER)
             print(f"{name}: {said}, {time.monotonic() - start:.0f} s", flush=True)
-    write_manifest(args)
-
-
-def drawn_counts(args, rng: np.random.Generator) -> list[int]:
-    """The numbers of samples per pixel of a view's noisy images, in order.
-
-    One is drawn for the reference to serve, large ones less often because they cost most. The
-    others are drawn from all that this reference serves, too.
-    """
-    if not args.counts:
-        return args.spp
-    chances = np.cbrt(1 / np.array(args.spp))
-    served = int(rng.choice(args.spp, p=chances / chances.sum()))
-    limit = max(served, args.ref_spp // views.REFERENCE_SHARE)
-    others = [count for count in args.spp if count <= limit and count != served]
-    return sorted([served, *map(int, rng.choice(others, min(args.counts - 1, len(others)), replace=False))])
+    write_manifest(args, RENDERER)
 
 
 def own_scenes(args, budget: views.Budget) -> Iterator[Base]:
@@ -205,34 +192,6 @@ def still_life(args, index: int) -> tuple[Still, np.random.Generator]:
     return still, rng
 
 
-def left_out(args) -> dict[str, str]:
-    """The reason for each view that was left out, from the manifest and from files of all workers."""
-    manifest = args.output / "manifest.json"
-    listed = json.loads(manifest.read_text()).get("left_out", {}) if manifest.exists() else {}
-    return listed | {path.stem: path.read_text() for path in sorted(args.output.glob(f"*/*{LEFT_OUT}"))}
-
-
-def write_manifest(args) -> None:
-    """Lists all rendered scenes and those of `--with`. A shard leaves that to the command without."""
-    if args.shard:
-        return
-    scenes = [views.entry_of(path) for path in sorted(args.output.glob("*/*.exr"))]
-    for other in args.beside:
-        for entry in json.loads((other / "manifest.json").read_text())["scenes"]:
-            file = os.path.relpath((other / entry["file"]).resolve(), args.output.resolve())
-            scenes.append(entry | {"file": file})
-    manifest = {"format": "demc-exr 1", "renderer": f"Mitsuba {mi.__version__}", "scenes": scenes, "left_out": left_out(args)}
-    write_json(args.output / "manifest.json", manifest)
-
-
-def numbers(text: str) -> list[int]:
-    """Rising positive numbers: `1,4,16`."""
-    found = sorted({int(part) for part in text.split(",")})
-    if found[0] < 1:
-        raise ValueError
-    return found
-
-
 def arguments() -> list[argparse.Namespace]:
     """The options of each part."""
     whole = argparse.RawDescriptionHelpFormatter
@@ -247,19 +206,13 @@ def arguments() -> list[argparse.Namespace]:
     parser.add_argument("--grain", type=float, default=0.6, metavar="SHARE", help="share of colours and patterns that are boards, stone, or cloth [0.6]")
     parser.add_argument("--black", type=float, default=0.2, metavar="SHARE", help="share of the rooms with black bars and blinds [0.2]")
     parser.add_argument("--studio", type=float, default=0.15, metavar="SHARE", help="share of the still lifes in a black studio [0.15]")
-    parser.add_argument("--spp", type=numbers, default=[4], metavar="N,...", help="samples per pixel of the noisy images [4]")
-    parser.add_argument("--counts", type=int, metavar="N", help="largest number of noisy images per view, drawn from --spp [all]")
     parser.add_argument("--traits", type=float, default=0.0, metavar="SHARE", help="share of the views with a Gaussian pixel filter, with albedo behind glass, and with another exposure, each [0]")
     parser.add_argument("--moving", type=float, default=0.0, metavar="SHARE", help="share of the views that a moving camera blurs [0]")
     parser.add_argument("--passes", choices=("paper",), help="also write what the paper's comparison needs: half buffers, variances, depth, diffuse and specular parts")
-    parser.add_argument("--ref-spp", type=int, default=128, metavar="N", help="largest number of samples per pixel of the reference [128]")
-    parser.add_argument("--residual", type=float, default=0.03, metavar="X", help="expected RelMSE at which a reference is good enough [0.03]")
     parser.add_argument("--edition", choices=[*EDITIONS], default="train", help="furniture, textures, and lights: of training, of the held-out set, of the paper's comparison, or glass balls; no two share any [train]")
     parser.add_argument("--kind", choices=[*KINDS], help="still lifes of a kind that is hard to denoise: glass and mirrors, many lamps, plants in the sun, nets and print, or hair")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of rooms, still lifes, and samples [1]")
-    parser.add_argument("--split", choices=("train", "test"), default="train", help="split of the rendered views [train]")
-    parser.add_argument("--with", dest="beside", action="append", default=[], type=Path, metavar="DIR", help="data set whose scenes are also listed; can be repeated")
     parser.add_argument("--preset", choices=[*PRESETS], help="training data or test scenes of the bundled models, or the scenes of the paper's comparison; other options change it")
+    add_flags(parser)
     add_shard_flag(parser, "views")
     parts = []
     for options in PRESETS.get(parser.parse_known_args()[0].preset, [{}]):

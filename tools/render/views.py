@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,18 +9,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 import tracer
 
-# The package of this checkout.
-sys.path.append(str(Path(__file__).resolve().parents[2] / "bindings" / "python"))
+sys.path.append(str(Path(__file__).resolve().parents[1]))
 
-from demc.torch.exr import write_whole
+from rendered import LUMINANCE, REFERENCE_SHARE, USUAL, Unsuitable, brightness, file_channels, rel_mse
 
-LUMINANCE = 0.22
-"""Mean luminance after scaling, without the brightest pixels."""
-TRIMMED = 0.02
-"""Share of the brightest pixels that the mean excludes."""
 CLAMP = 45.0
 """Upper limit of a sample, in units of that mean."""
 PROBE_SAMPLES = 8
@@ -30,36 +23,14 @@ ROUND_SAMPLES = 16
 """Samples per pixel of one round of the reference. Rounds alternate between two halves."""
 MOTION = (0.003, 0.04)
 """Shortest and longest way of a moving camera, as shares of the median distance."""
-EPSILON = 0.001
-"""Epsilon of RelMSE (Eq. 5)."""
-USUAL = 4
-"""Samples per pixel that the limits on noise are for."""
 FEW, MANY = 64, 1 << 31
 """Noisy images of more samples per pixel than `FEW` use seeds from `MANY` on."""
-REFERENCE_SHARE = 4
-"""A reference has at least this many times the samples of the noisy image, or a residual below this part of its noise."""
-CHANNELS = {
-    "color": ("", "RGB"),
-    "normal": ("normal.", "XYZ"),
-    "position": ("position.", "XYZ"),
-    "albedo1": ("albedo1.", "RGB"),
-    "albedo2": ("albedo2.", "RGB"),
-    "mask": ("mask.", "A"),
-    "depth": ("depth.", "Z"),
-    "diffuse": ("diffuse.", "RGB"),
-    "specular": ("specular.", "RGB"),
-}
-"""Start and ends of each buffer's channel names."""
 HALVES = ("color", "normal", "albedo1", "depth")
 """Buffers that have two half buffers, `half1.NAME` and `half2.NAME`, with passes."""
 PARTS = ("diffuse", "specular")
 """The parts of colour and reference."""
 GUIDES = ("normal", "albedo1")
 """Features of the reference's own samples that are written, for `tools/references.py`."""
-
-
-class Unsuitable(Exception):
-    """The view is useless for training."""
 
 
 @dataclass
@@ -110,10 +81,7 @@ def photograph(
     also half buffers, variances, depth, and the diffuse and the specular part of colour and reference.
     """
     probe = tracer.render(scene, PROBE_SAMPLES, seed, view=view)
-    luminance = np.sort((probe.color / probe.count @ [0.2126, 0.7152, 0.0722]).ravel())
-    mean = luminance[: int(len(luminance) * (1 - TRIMMED))].mean()
-    if not mean > 1e-4:
-        raise Unsuitable("dark")
+    mean = brightness(probe.color / probe.count)
     eye = np.ravel(scene.sensors()[view].world_transform().translation())
     distance = np.linalg.norm(probe.features["position"] / probe.count - eye, axis=-1)
     if np.quantile(distance, 0.3) < budget.near:
@@ -204,28 +172,6 @@ def noisy_images(
     return images
 
 
-def file_channels(buffers: dict[str, np.ndarray], scaled: bool) -> dict[str, np.ndarray]:
-    """The channels of a file, `[H, W]` each: half floats where they are exact enough.
-
-    `scaled`: radiance may be too bright or too dark for half floats.
-    """
-    channels = {}
-    for buffer, planes in buffers.items():
-        before, _, name = buffer.rpartition(".")
-        before += "." if before else ""
-        prefix, ends = CHANNELS[name]
-        coarse = (
-            before == "variance."
-            or (name in ("position", "depth") and too_coarse(planes))
-            or (name == "color" and scaled)
-        )
-        kind = np.float32 if coarse else np.float16
-        limit = np.finfo(kind).max
-        for i, end in enumerate(ends):
-            channels[before + prefix + end] = np.ascontiguousarray(planes[..., i].clip(-limit, limit).astype(kind))
-    return channels
-
-
 def filtered(planes: np.ndarray, sigma: float) -> np.ndarray:
     """`[H, W, C]` filtered with a Gaussian of this standard deviation, in pixels; the border is replicated."""
     if sigma == 0:
@@ -238,26 +184,3 @@ def filtered(planes: np.ndarray, sigma: float) -> np.ndarray:
         taken = [planes.take(np.clip(np.arange(length) + offset, 0, length - 1), axis) for offset in offsets]
         planes = sum(weight * part for weight, part in zip(weights, taken))
     return planes
-
-
-def rel_mse(difference: np.ndarray, reference: np.ndarray) -> float:
-    """Eq. 5, summed over rgb."""
-    return float((difference**2 / (reference**2 + EPSILON)).mean() * 3)
-
-
-def too_coarse(position: np.ndarray) -> bool:
-    """Whether the step of a 16-bit float exceeds a thousandth of the visible extent."""
-    step = float(np.spacing(np.float16(min(np.abs(position).max(), 6e4))))
-    return np.abs(position).max() > 6e4 or step > np.ptp(position, axis=(0, 1)).max() / 1000
-
-
-def write(path: Path, channels: dict[str, np.ndarray], entry: dict) -> None:
-    """Writes the EXR file completely or not at all. Its header contains the manifest's entry."""
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "demc": json.dumps(entry)}
-    write_whole(path, OpenEXR.File(header, channels))
-
-
-def entry_of(path: Path) -> dict:
-    """The manifest's entry in a file's header."""
-    with OpenEXR.File(str(path), header_only=True) as file:
-        return json.loads(file.header()["demc"])

@@ -33,8 +33,9 @@ def run(*arguments: object) -> subprocess.CompletedProcess:
 class Render(unittest.TestCase):
     @classmethod
     def setUpClass(cls) -> None:
-        sys.path.insert(0, str(FOLDER))
-        cls.addClassCleanup(sys.path.remove, str(FOLDER))
+        for folder in (FOLDER.parent, FOLDER):
+            sys.path.insert(0, str(folder))
+            cls.addClassCleanup(sys.path.remove, str(folder))
 
     def scene(self) -> dict:
         """A box with a light, a plastic wall, and a metal ball."""
@@ -308,7 +309,7 @@ class Render(unittest.TestCase):
 
     def check_resume(self, kind: str) -> None:
         import numpy as np
-        import views
+        import rendered
 
         with tempfile.TemporaryDirectory() as folder:
             ask = (kind, 1, "--views", 2, "--size", 32, "--ref-spp", 32)
@@ -324,7 +325,7 @@ class Render(unittest.TestCase):
             for scene in scenes:
                 files = [(out / scene["file"]).read_bytes() for out in (first, second)]
                 self.assertEqual(*files)
-                self.assertEqual(views.entry_of(first / scene["file"]), scene)
+                self.assertEqual(rendered.entry_of(first / scene["file"]), scene)
             again = run("-o", first, *ask, "--with", second)
             self.assertEqual((again.returncode, again.stdout), (0, ""), again.stderr)
             both = json.loads((first / "manifest.json").read_text())["scenes"]

@@ -1,0 +1,111 @@
+"""Renders training data with Blender Cycles: volumes, hair, motion, procedural materials.
+
+    pip install bpy numpy OpenEXR
+    python tools/cycles -o data/cycles --scenes 60                   scenes of all kinds, from a seed
+    python tools/cycles -o data/smoke --scenes 20 --kind volume      of one kind
+    python tools/cycles -o data/cycles --scenes 60 --with data/rooms lists other scenes, too
+    python tools/cycles -o data/cycles --scenes 60 --shard 1/4       a part, on a farm (docs/farms.md)
+    python tools/cycles -o data/bundled --preset train               a part of the training data of the bundled models
+    python tools/cycles -o data/heldout-2 --preset heldout-2        a part of their test scenes
+
+Features are those that Cycles writes; the second albedo is a copy of the first. The same seed gives the same scenes and
+samples, but Cycles changes about 0.4 % of the values from run to run. Existing images are kept: rerun a command to
+resume it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+
+import rendered
+import scenes
+import shot
+
+from demc.torch.files import write_text  # `rendered` puts the package on the path.
+from demc.torch.shard import add_shard_flag
+
+RENDERER = f"Cycles {scenes.bpy.app.version_string}"
+SHARES = {"things": 0.25, "volume": 0.35, "fur": 0.25, "motion": 0.15}
+"""How many scenes are of each kind."""
+NOISE = (0.003, 16.0)
+"""Range of RelMSE of an image with 4 samples per pixel. Views outside it are left out."""
+
+PRESETS = {
+    "train": {"scenes": 160, "size": 192, "spp": rendered.COUNTS, "counts": 3, "seed": 5929},
+    "heldout-2": rendered.HELD_OUT | {"scenes": 36, "seed": 6929},
+}
+"""Options of `--preset`."""
+
+
+def main() -> None:
+    args = arguments()
+    folder = args.output / args.split
+    folder.mkdir(parents=True, exist_ok=True)
+    known = rendered.left_out(args.output)
+    kinds = [args.kind] * args.scenes if args.kind else in_turn(args.scenes)
+    names = {f"cycles-{args.seed}-{index}-{view}": (index, view) for index in range(args.scenes) for view in range(args.views)}
+    own = args.shard.keep(set(names)) if args.shard else set(names)
+    for name, (index, view) in names.items():
+        rng = np.random.default_rng([args.seed, index, view, 1])
+        counts = rendered.drawn_counts(args, rng)
+        files = {count: name if args.spp == [count] else f"{name}-{count}spp" for count in counts}
+        if name not in own or name in known or all((folder / f"{file}.exr").exists() for file in files.values()):
+            continue
+        start = time.monotonic()
+        try:
+            stage = scenes.build(args.seed, index, kinds[index], args.edition)
+            stage.camera(np.random.default_rng([args.seed, index, view, 3]))
+            settings = shot.Settings.draw(rng, args.adaptive)
+            shot.prepare(stage.scene, args.size, settings)
+            seed = (args.seed * 100003 + index * 16 + view) * 1000
+            images = shot.photograph(stage.scene, seed, counts, settings, args.ref_spp, args.residual, NOISE)
+            for (channels, facts), file in zip(images, files.values()):
+                place = {"name": file, "split": args.split, "base": f"cycles-{args.seed}-{index}", "file": f"{args.split}/{file}.exr", "kind": kinds[index]}
+                if args.counts:
+                    place["repeat"] = rendered.repeat(facts["spp"])
+                rendered.write(folder / f"{file}.exr", channels, place | facts)
+            said = f"{kinds[index]}, RelMSE {images[0][1]['noisy_relmse']:.2f} at {counts[0]} spp, reference {facts['ref_residual_relmse']:.4f} at {facts['ref_spp']} spp"
+        except rendered.Unsuitable as reason:
+            write_text(folder / f"{name}{rendered.LEFT_OUT}", str(reason))
+            said = f"left out: {reason}"
+        rendered.write_manifest(args, RENDERER)
+        print(f"{name}: {said}, {time.monotonic() - start:.0f} s", flush=True)
+    rendered.write_manifest(args, RENDERER)
+
+
+def in_turn(count: int) -> list[str]:
+    """The kind of each scene: always the one that is furthest behind its share."""
+    found: list[str] = []
+    for number in range(1, count + 1):
+        found.append(max(SHARES, key=lambda kind: SHARES[kind] * number - found.count(kind)))
+    return found
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser("python tools/cycles", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", required=True, type=Path, metavar="DIR", help="data set; other images in it are kept")
+    parser.add_argument("--scenes", type=int, default=0, metavar="N", help="number of scenes")
+    parser.add_argument("--views", type=int, default=2, metavar="N", help="views per scene [2]")
+    parser.add_argument("--size", type=int, default=224, metavar="PIXELS", help="height and width [224]")
+    parser.add_argument("--kind", choices=[*scenes.KINDS], help="things alone, in fog, smoke, or clouds, with hair, or moving [all in turn]")
+    parser.add_argument("--adaptive", type=float, default=0.3, metavar="SHARE", help="share of the views with adaptive sampling [0.3]")
+    parser.add_argument("--edition", choices=[*scenes.EDITIONS], default="train", help="shapes, textures, and lights of training or of the held-out set; they share none [train]")
+    rendered.add_flags(parser)
+    parser.add_argument("--preset", choices=[*PRESETS], help="training data or test scenes of the bundled models; other options change it")
+    add_shard_flag(parser, "views")
+    parser.set_defaults(**PRESETS.get(parser.parse_known_args()[0].preset, {}))
+    args = parser.parse_args()
+    if args.scenes < 1:
+        parser.error("nothing to render: --scenes N")
+    return args
+
+
+if __name__ == "__main__":
+    main()
