@@ -4,7 +4,8 @@
     pip install numpy OpenEXR pyoidn
     python3 benches/quality.py --data public=data/renders --data held-out=data/heldout
 
-Each row is one program on the test scenes of one data set with one number of samples per pixel. A ratio
+Each row is one program on the test scenes of one data set with one number of samples per pixel; with 4, also
+on those of each kind and of each renderer. A ratio
 or difference compares with the better of OIDN (quality high) with albedo and normal, plain and denoised
 first, per column. Intervals are 95 % bootstrap intervals over scenes. The images of OIDN and the scores
 are kept in --work.
@@ -30,6 +31,8 @@ COLUMNS = {
     "FLIP": (lambda scores: scores["flip"].mean(-1), True, True),
     "energy bias, absolute": (lambda scores: np.abs(scores["energy-bias"]).mean(-1), False, True),
 }
+USUAL = 4
+"""Samples per pixel of the tables per kind of scene and per renderer."""
 METRICS = ("relmse", "ssim", "flip", "energy-bias")
 
 
@@ -60,13 +63,23 @@ def scores_of(data: pathlib.Path, model: tuple[str, pathlib.Path], work: pathlib
     return {image["name"]: {"noisy": image["noisy"], name: image["denoised"]} | image["baselines"] for image in images}
 
 
-def groups(data: pathlib.Path) -> dict[int, list[str]]:
-    """The test scenes of each number of samples per pixel."""
-    found: dict[int, list[str]] = {}
-    for scene in json.loads((data / "manifest.json").read_text())["scenes"]:
-        if scene["split"] == "test":
-            found.setdefault(scene["spp"], []).append(scene["name"])
-    return dict(sorted(found.items()))
+def groups(data: pathlib.Path) -> dict[str, list[str]]:
+    """The test scenes of each number of samples per pixel, of each kind, and of each renderer.
+
+    `tools/render` and `tools/cycles` write the kind. Other scenes have the first word of their name, such as `room`.
+    """
+    manifest = json.loads((data / "manifest.json").read_text())
+    scenes = sorted((scene for scene in manifest["scenes"] if scene["split"] == "test"), key=lambda scene: scene["spp"])
+    counts: dict[str, list[str]] = {}
+    parts: dict[str, list[str]] = {}
+    for scene in scenes:
+        counts.setdefault(f"{scene['spp']} spp", []).append(scene["name"])
+        if scene["spp"] == USUAL:
+            renderer = scene.get("renderer", "Mitsuba").split()[0]
+            for part in (scene.get("kind", scene["name"].split("-")[0]), renderer):
+                parts.setdefault(f"{part}, {USUAL} spp", []).append(scene["name"])
+    # A part that has all scenes says nothing new.
+    return counts | {part: names for part, names in sorted(parts.items()) if names != counts[f"{USUAL} spp"]}
 
 
 def table(scores: dict, scenes: list[str]) -> list[list[str]]:
@@ -106,8 +119,8 @@ def main() -> None:
         for model in args.model or BUNDLED:
             for scene, programs in scores_of(data, model, work, args.program).items():
                 scores.setdefault(scene, {}).update(programs)
-        for count, scenes in groups(data).items():
-            print(f"\n{data_name}, {count} spp, {len(scenes)} scenes\n")
+        for group, scenes in groups(data).items():
+            print(f"\n{data_name}, {group}, {len(scenes)} scenes\n")
             print("| program | " + " | ".join(COLUMNS) + " |\n|---|" + "---:|" * len(COLUMNS))
             for row in table(scores, scenes):
                 print("| " + " | ".join(row) + " |")
