@@ -5,10 +5,9 @@
     python3 benches/quality.py --data public=data/renders --data held-out=data/heldout
 
 Each row is one program on the test scenes of one data set with one number of samples per pixel; with 4, also
-on those of each kind and of each renderer. A ratio
-or difference compares with the better of OIDN (quality high) with albedo and normal, plain and denoised
-first, per column. Intervals are 95 % bootstrap intervals over scenes. The images of OIDN and the scores
-are kept in --work.
+on those of each kind and of each renderer. A ratio or difference compares with the better of OIDN (quality
+high) with albedo and normal, plain and denoised first, per column. Intervals are 95 % bootstrap intervals
+over scenes. The images of OIDN and the scores are kept in --work.
 """
 import argparse
 import json
@@ -75,7 +74,7 @@ def groups(data: pathlib.Path) -> dict[str, list[str]]:
     for scene in scenes:
         counts.setdefault(f"{scene['spp']} spp", []).append(scene["name"])
         if scene["spp"] == USUAL:
-            renderer = scene.get("renderer", "Mitsuba").split()[0]
+            renderer = scene.get("renderer", manifest.get("renderer", "unknown renderer")).split(" ")[0]
             for part in (scene.get("kind", scene["name"].split("-")[0]), renderer):
                 parts.setdefault(f"{part}, {USUAL} spp", []).append(scene["name"])
     # A part that has all scenes says nothing new.

@@ -6,6 +6,8 @@ import argparse
 import json
 import os
 import sys
+import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ import OpenEXR
 sys.path.append(str(Path(__file__).resolve().parents[1] / "bindings" / "python"))
 
 from demc.torch.exr import write_whole
-from demc.torch.files import write_json
+from demc.torch.files import write_json, write_text
 
 LUMINANCE = 0.22
 """Mean luminance after scaling, without the brightest pixels."""
@@ -23,6 +25,10 @@ TRIMMED = 0.02
 """Share of the brightest pixels that the mean excludes."""
 EPSILON = 0.001
 """Epsilon of RelMSE (Eq. 5)."""
+CLAMP = 45.0
+"""Upper limit of a sample, in units of the mean luminance."""
+GUIDES = ("normal", "albedo1")
+"""Features of the reference's own samples that are written, for `tools/references.py`."""
 USUAL = 4
 """Samples per pixel that the limits on noise are for."""
 LEFT_OUT = ".left-out"
@@ -129,6 +135,40 @@ def drawn_counts(args: argparse.Namespace, rng: np.random.Generator) -> list[int
     return sorted([served, *map(int, rng.choice(others, min(args.counts - 1, len(others)), replace=False))])
 
 
+def files_of(name: str, counts: list[int], args: argparse.Namespace) -> dict[int, str]:
+    """The names of a view's files, by number of samples per pixel."""
+    return {count: name if args.spp == [count] else f"{name}-{count}spp" for count in counts}
+
+
+def make_view(
+    args: argparse.Namespace,
+    name: str,
+    place: dict,
+    files: Iterable[str],
+    renderer: str,
+    photograph: Callable[[], list[tuple[dict, dict]]],
+) -> None:
+    """Writes the images of a view, or why it is left out, and the manifest.
+
+    `photograph` returns channels and facts of each of `files`. `place` has the `base` and, if any, the `kind` of the view.
+    """
+    start, said = time.monotonic(), []
+    folder = args.output / args.split
+    try:
+        for (channels, facts), file in zip(photograph(), files):
+            entry = {"name": file, "split": args.split, "base": place["base"], "file": f"{args.split}/{file}.exr"} | place
+            if args.counts:
+                entry["repeat"] = repeat(facts["spp"])
+            write(folder / f"{file}.exr", channels, entry | facts)
+            said.append("RelMSE {noisy_relmse:.2f} at {spp} spp".format(**facts))
+        said.append("reference {ref_residual_relmse:.4f} at {ref_spp} spp".format(**facts))
+    except Unsuitable as reason:
+        write_text(folder / f"{name}{LEFT_OUT}", str(reason))
+        said = [f"left out: {reason}"]
+    write_manifest(args, renderer)
+    print(f"{name}: {', '.join(said)}, {time.monotonic() - start:.0f} s", flush=True)
+
+
 def left_out(output: Path) -> dict[str, str]:
     """The reason for each view that was left out, from the manifest and from files of all workers."""
     manifest = output / "manifest.json"
@@ -142,9 +182,11 @@ def write_manifest(args: argparse.Namespace, renderer: str) -> None:
         return
     scenes = [entry_of(path) for path in sorted(args.output.glob("*/*.exr"))]
     for other in args.beside:
-        for entry in json.loads((other / "manifest.json").read_text())["scenes"]:
+        listed = json.loads((other / "manifest.json").read_text())
+        theirs = {"renderer": listed["renderer"]} if "renderer" in listed else {}
+        for entry in listed["scenes"]:
             file = os.path.relpath((other / entry["file"]).resolve(), args.output.resolve())
-            scenes.append(entry | {"file": file})
+            scenes.append(theirs | entry | {"file": file})
     manifest = {"format": "demc-exr 1", "renderer": renderer, "scenes": scenes, "left_out": left_out(args.output)}
     write_json(args.output / "manifest.json", manifest)
 

@@ -5,19 +5,21 @@
     python tools/cycles -o data/smoke --scenes 20 --kind volume      of one kind
     python tools/cycles -o data/cycles --scenes 60 --with data/rooms lists other scenes, too
     python tools/cycles -o data/cycles --scenes 60 --shard 1/4       a part, on a farm (docs/farms.md)
-    python tools/cycles -o data/bundled --preset train               a part of the training data of the bundled models
-    python tools/cycles -o data/heldout-2 --preset heldout-2        a part of their test scenes
+    python tools/cycles -o data/blender --preset train --with data/bundled
+                                                                     training data of the bundled models
+    python tools/cycles -o data/heldout-cycles --preset heldout-2 --with data/heldout-2
+                                                                     their test scenes, second edition
 
-Features are those that Cycles writes; the second albedo is a copy of the first. The same seed gives the same scenes and
-samples, but Cycles changes about 0.4 % of the values from run to run. Existing images are kept: rerun a command to
-resume it.
+Features are those that Cycles writes; the second albedo is a copy of the first. The same seed gives the same views but for
+rounding, except hair, which Blender does not always place in the same way. Existing images are kept: rerun a command
+to resume it.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,15 +30,13 @@ import rendered
 import scenes
 import shot
 
-from demc.torch.files import write_text  # `rendered` puts the package on the path.
-from demc.torch.shard import add_shard_flag
+from demc.torch.shard import add_shard_flag  # `rendered` puts the package on the path.
 
 RENDERER = f"Cycles {scenes.bpy.app.version_string}"
 SHARES = {"things": 0.25, "volume": 0.35, "fur": 0.25, "motion": 0.15}
 """How many scenes are of each kind."""
 NOISE = (0.003, 16.0)
 """Range of RelMSE of an image with 4 samples per pixel. Views outside it are left out."""
-
 PRESETS = {
     "train": {"scenes": 160, "size": 192, "spp": rendered.COUNTS, "counts": 3, "seed": 5929},
     "heldout-2": rendered.HELD_OUT | {"scenes": 36, "seed": 6929},
@@ -55,29 +55,22 @@ def main() -> None:
     for name, (index, view) in names.items():
         rng = np.random.default_rng([args.seed, index, view, 1])
         counts = rendered.drawn_counts(args, rng)
-        files = {count: name if args.spp == [count] else f"{name}-{count}spp" for count in counts}
+        files = rendered.files_of(name, counts, args)
         if name not in own or name in known or all((folder / f"{file}.exr").exists() for file in files.values()):
             continue
-        start = time.monotonic()
-        try:
-            stage = scenes.build(args.seed, index, kinds[index], args.edition)
-            stage.camera(np.random.default_rng([args.seed, index, view, 3]))
-            settings = shot.Settings.draw(rng, args.adaptive)
-            shot.prepare(stage.scene, args.size, settings)
-            seed = (args.seed * 100003 + index * 16 + view) * 1000
-            images = shot.photograph(stage.scene, seed, counts, settings, args.ref_spp, args.residual, NOISE)
-            for (channels, facts), file in zip(images, files.values()):
-                place = {"name": file, "split": args.split, "base": f"cycles-{args.seed}-{index}", "file": f"{args.split}/{file}.exr", "kind": kinds[index]}
-                if args.counts:
-                    place["repeat"] = rendered.repeat(facts["spp"])
-                rendered.write(folder / f"{file}.exr", channels, place | facts)
-            said = f"{kinds[index]}, RelMSE {images[0][1]['noisy_relmse']:.2f} at {counts[0]} spp, reference {facts['ref_residual_relmse']:.4f} at {facts['ref_spp']} spp"
-        except rendered.Unsuitable as reason:
-            write_text(folder / f"{name}{rendered.LEFT_OUT}", str(reason))
-            said = f"left out: {reason}"
-        rendered.write_manifest(args, RENDERER)
-        print(f"{name}: {said}, {time.monotonic() - start:.0f} s", flush=True)
+        place = {"base": f"cycles-{args.seed}-{index}", "kind": kinds[index]}
+        photograph = partial(photograph_view, args, index, view, kinds[index], counts, shot.Settings.draw(rng, args.adaptive))
+        rendered.make_view(args, name, place, files.values(), RENDERER, photograph)
     rendered.write_manifest(args, RENDERER)
+
+
+def photograph_view(args, index: int, view: int, kind: str, counts: list[int], settings: shot.Settings) -> list[tuple[dict, dict]]:
+    """Builds a scene and renders one view of it."""
+    stage = scenes.build(args.seed, index, kind, args.edition)
+    stage.camera(np.random.default_rng([args.seed, index, view, 3]))
+    shot.prepare(stage.scene, args.size, settings)
+    seed = (args.seed * 100003 + index * 16 + view) * 1000
+    return shot.photograph(stage.scene, seed, counts, settings, args.ref_spp, args.residual, NOISE)
 
 
 def in_turn(count: int) -> list[str]:

@@ -149,7 +149,8 @@ class Stage:
         size, out, turn = logarithmic(rng, 0.15, 0.9), 1.3 * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
         thing.location = Vector((out * np.cos(turn), out * np.sin(turn), 0)) + thing.location * size
         thing.scale = thing.scale * size
-        thing.rotation_euler.rotate_axis("Z", float(rng.uniform(0, 2 * np.pi))) if thing.type != "FONT" else None
+        if thing.type != "FONT":
+            thing.rotation_euler.rotate_axis("Z", float(rng.uniform(0, 2 * np.pi)))
         thing.data.materials.append(self.painter.any_material())
         self.things.append(thing)
         return thing

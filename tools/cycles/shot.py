@@ -11,19 +11,15 @@ from pathlib import Path
 import bpy
 import numpy as np
 import OpenEXR
-from rendered import LUMINANCE, REFERENCE_SHARE, USUAL, Unsuitable, brightness, file_channels, rel_mse
+from rendered import CLAMP, GUIDES, LUMINANCE, REFERENCE_SHARE, USUAL, Unsuitable, brightness, file_channels, rel_mse
 from shading import Rng
 
-CLAMP = 45.0
-"""Upper limit of a sample's indirect light, in units of the mean luminance."""
 PROBE_SAMPLES = 8
 """Samples per pixel for measuring the mean."""
 FIRST_HALF = 16
 """Samples per pixel of each half of the reference, at first."""
 BUFFERS = {"color": "Combined.RGB", "normal": "Normal.XYZ", "position": "Position.XYZ", "albedo1": "Denoising Albedo.RGB"}
 """The pass and the channels of each buffer."""
-GUIDES = ("normal", "albedo1")
-"""Features of the reference's own samples that are written, for `tools/references.py`."""
 FILTERS = {"BOX": 1.0, "BLACKMAN_HARRIS": 1.5, "GAUSSIAN": 1.5}
 """Pixel filters and their usual widths, in pixels."""
 

@@ -21,9 +21,9 @@ libllvm19); DRJIT_LIBLLVM_PATH names it if Mitsuba does not find it.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,9 +35,8 @@ from rooms import Room
 from stills import Still
 from variant import mi
 
-from demc.torch.files import write_text  # `views` puts the packages on the path.
-from demc.torch.shard import add_shard_flag
-from rendered import COUNTS, HELD_OUT, LEFT_OUT, TEST, Unsuitable, add_flags, drawn_counts, left_out, repeat, write, write_manifest
+from demc.torch.shard import add_shard_flag  # `views` puts the packages on the path.
+from rendered import COUNTS, HELD_OUT, TEST, add_flags, drawn_counts, files_of, left_out, make_view, write_manifest
 
 RENDERER = f"Mitsuba {mi.__version__}"
 NOISE = (0.2, 16.0)
@@ -109,7 +108,7 @@ def render(args: argparse.Namespace) -> None:
         for view, name in enumerate(base.views):
             rng = np.random.default_rng([base.seed, view, 7])
             counts = drawn_counts(args, rng)
-            files = {count: name if args.spp == [count] else f"{name}-{count}spp" for count in counts}
+            files = files_of(name, counts, args)
             wanted[name] = files, views.Traits.draw(rng, args.traits, args.moving)
         missing = [
             name for name, (files, _) in wanted.items()
@@ -117,27 +116,12 @@ def render(args: argparse.Namespace) -> None:
         ]
         scene = base.load() if missing else None
         for name in missing:
-            start, view = time.monotonic(), base.views.index(name)
+            view = base.views.index(name)
             files, traits = wanted[name]
-            try:
-                said = []
-                images = views.photograph(
-                    scene, view, (base.seed + view) * 1000, base.budget, [*files], traits, args.passes is not None
-                )
-                for (channels, facts), file in zip(images, files.values()):
-                    place = {"name": file, "split": args.split, "base": base.name, "file": f"{args.split}/{file}.exr"}
-                    if args.kind:
-                        place["kind"] = args.kind
-                    if args.counts:
-                        place["repeat"] = repeat(facts["spp"])
-                    write(folder / f"{file}.exr", channels, place | facts)
-                    said.append("RelMSE {noisy_relmse:.2f} at {spp} spp".format(**facts))
-                said = f"{', '.join(said)}, reference {facts['ref_residual_relmse']:.4f} at {facts['ref_spp']} spp"
-            except Unsuitable as reason:
-                write_text(folder / f"{name}{LEFT_OUT}", str(reason))
-                said = f"left out: {reason}"
-            write_manifest(args, RENDERER)
-            print(f"{name}: {said}, {time.monotonic() - start:.0f} s", flush=True)
+            place = {"base": base.name} | ({"kind": args.kind} if args.kind else {})
+            seed, passes = (base.seed + view) * 1000, args.passes is not None
+            photograph = partial(views.photograph, scene, view, seed, base.budget, [*files], traits, passes)
+            make_view(args, name, place, files.values(), RENDERER, photograph)
     write_manifest(args, RENDERER)
 
 

@@ -13,10 +13,8 @@ import tracer
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
-from rendered import LUMINANCE, REFERENCE_SHARE, USUAL, Unsuitable, brightness, file_channels, rel_mse
+from rendered import CLAMP, GUIDES, LUMINANCE, REFERENCE_SHARE, USUAL, Unsuitable, brightness, file_channels, rel_mse
 
-CLAMP = 45.0
-"""Upper limit of a sample, in units of that mean."""
 PROBE_SAMPLES = 8
 """Samples per pixel for measuring the mean."""
 ROUND_SAMPLES = 16
@@ -29,8 +27,6 @@ HALVES = ("color", "normal", "albedo1", "depth")
 """Buffers that have two half buffers, `half1.NAME` and `half2.NAME`, with passes."""
 PARTS = ("diffuse", "specular")
 """The parts of colour and reference."""
-GUIDES = ("normal", "albedo1")
-"""Features of the reference's own samples that are written, for `tools/references.py`."""
 
 
 @dataclass
