@@ -3,7 +3,7 @@
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use super::axis::{Axis, shows};
+use super::axis::{Axis, number, shows};
 use super::figure::{AxisScale, Category, CategoryFigure, CategoryPanel};
 use super::frame::{
     Area, EDGE, GREY, GRID, INK, LOWER, ROW, SIZES, font, palette, text_style, width,
@@ -19,10 +19,14 @@ const AROUND: i32 = 5 * ROW;
 const HALF: f64 = 0.3;
 /// Half of the height of an interval's ends.
 const CAP: f64 = 0.15;
+/// Opacity of a bar, under the line of its interval.
+const OPACITY: f64 = 0.7;
 const LINE: u32 = 4;
 const RADIUS: i32 = 9;
 /// Space beyond the data, as a share of the axis.
 const MARGIN: f64 = 0.05;
+/// A bar is cut, and its value written on it, if it ends beyond this multiple of all others.
+const CUT: f64 = 2.0;
 
 impl CategoryFigure {
     /// Width and height in drawing units.
@@ -50,18 +54,34 @@ fn names_width(panel: &CategoryPanel) -> i32 {
     widest.unwrap_or(0) + 2 * EDGE
 }
 
+/// All ends of a category on the axis.
+fn ends(row: &Category) -> impl Iterator<Item = f64> {
+    row.interval.into_iter().flatten().chain([row.value])
+}
+
+/// The value at which the axis of bars ends before its margin, if one bar is much longer than all others.
+fn bars_limit(panel: &CategoryPanel) -> f64 {
+    let longest = |row: &&Category| ends(row).fold(0.0, f64::max);
+    let mut rows: Vec<&Category> = panel.rows.iter().collect();
+    rows.sort_by(|a, b| longest(a).total_cmp(&longest(b)));
+    match rows[..] {
+        [.., second, last] if last.value > CUT * longest(&second) => CUT * longest(&second),
+        _ => f64::INFINITY,
+    }
+}
+
 fn draw_panel<B: DrawingBackend>(area: &Area<B>, panel: &CategoryPanel) -> DrawResult<(), B> {
     let area = area
         .margin(EDGE, 0, 0, 0)
         .titled(&panel.title, font(SIZES[0]).color(&INK))?;
-    let ends = |row: &Category| row.interval.into_iter().flatten().chain([row.value]);
+    let limit = if panel.bars {
+        bars_limit(panel)
+    } else {
+        f64::INFINITY
+    };
     let zero = panel.bars.then_some(0.0);
-    let values = panel
-        .rows
-        .iter()
-        .flat_map(ends)
-        .chain(panel.line)
-        .chain(zero);
+    let ends = panel.rows.iter().flat_map(ends).map(|end| end.min(limit));
+    let values = ends.chain(panel.line).chain(zero);
     let is_shown = |value: &f64| shows(panel.x, *value);
     // A bar starts at the edge.
     let margins = [if panel.bars { 0.0 } else { MARGIN }, MARGIN];
@@ -90,13 +110,15 @@ fn draw_panel<B: DrawingBackend>(area: &Area<B>, panel: &CategoryPanel) -> DrawR
     for (index, row) in panel.rows.iter().enumerate() {
         let middle = count - 0.5 - index as f64;
         let color = palette(row.color);
+        let is_cut = row.value > limit;
         if panel.bars {
-            let corners = [(0.0, middle - HALF), (row.value, middle + HALF)];
-            chart.draw_series([Rectangle::new(corners, color.filled())])?;
+            let end = row.value.min(chart.x_range().end);
+            let corners = [(0.0, middle - HALF), (end, middle + HALF)];
+            chart.draw_series([Rectangle::new(corners, color.mix(OPACITY).filled())])?;
         } else {
             chart.draw_series([Circle::new((row.value, middle), RADIUS, color.filled())])?;
         }
-        if let Some([low, high]) = row.interval {
+        if let Some([low, high]) = row.interval.filter(|_| !is_cut) {
             let ink = if panel.bars { INK } else { color };
             let lines = [
                 [(low, middle), (high, middle)],
@@ -111,6 +133,12 @@ fn draw_panel<B: DrawingBackend>(area: &Area<B>, panel: &CategoryPanel) -> DrawR
         let at = (left - base_x - EDGE, height - base_y + LOWER);
         let style = text_style(INK).pos(Pos::new(HPos::Right, VPos::Center));
         area.draw(&Text::new(row.name.clone(), at, style))?;
+        if is_cut {
+            let (right, _) = chart.backend_coord(&(chart.x_range().end, middle));
+            let at = (right - base_x - EDGE, height - base_y + LOWER);
+            let style = text_style(INK).pos(Pos::new(HPos::Right, VPos::Center));
+            area.draw(&Text::new(number(row.value, 2), at, style))?;
+        }
     }
     if let Some(value) = panel.line.filter(is_shown) {
         let ends = [(value, 0.0), (value, count)];

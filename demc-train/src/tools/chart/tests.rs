@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use super::figure::{AxisScale, LinePanel, Series};
+use super::figure::{AxisScale, Category, CategoryPanel, LinePanel, Series};
 use super::frame::palette;
 use super::*;
 
@@ -227,4 +227,41 @@ fn a_name_may_have_its_ending_already() {
     assert_eq!(name("a/p.svg", "csv"), "a/p.csv");
     assert_eq!(name("a/run.2", "svg"), "a/run.2.svg");
     assert!(with_extension(Path::new("a/"), "svg").is_err());
+}
+
+/// The widths of the bars of these values.
+fn bars(values: &[f64]) -> (Vec<i32>, String) {
+    let rows = values.iter().map(|value| Category {
+        name: "variant".to_string(),
+        value: *value,
+        interval: Some([0.9 * value, 1.1 * value]),
+        color: 0,
+    });
+    let panel = CategoryPanel {
+        title: "RelMSE".to_string(),
+        x_label: "mean".to_string(),
+        x: AxisScale::Linear,
+        bars: true,
+        rows: rows.collect(),
+        line: None,
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let path = CategoryFigure(vec![panel])
+        .write(&dir.path().join("bars"))
+        .unwrap();
+    let svg = fs::read_to_string(path).unwrap();
+    (attributes(&svg, "rect", palette(0), "width"), svg)
+}
+
+#[test]
+fn a_bar_much_longer_than_the_others_is_cut() {
+    let (widths, svg) = bars(&[0.1, 0.2, 1.5]);
+    assert_eq!(says(&svg, "1.5"), 1);
+    assert!((2 * widths[0] - widths[1]).abs() <= 2, "{widths:?}");
+    assert!(widths[2] > 2 * widths[1], "{widths:?}");
+    assert!(widths[2] < 5 * widths[1] / 2, "{widths:?}");
+
+    let (widths, svg) = bars(&[0.1, 0.2, 0.3]);
+    assert_eq!(says(&svg, "0.3"), 1, "a label of the axis");
+    assert!((3 * widths[0] - widths[2]).abs() <= 3, "{widths:?}");
 }
