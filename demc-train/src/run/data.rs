@@ -21,6 +21,7 @@ use demc_program::checksum::sha256_of;
 use demc_program::message::short_list;
 use demc_program::output::Outputs;
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 
 use crate::config::Config;
 use crate::ranks::NodeShare;
@@ -64,18 +65,24 @@ fn checksums<'a>(
 pub struct DataContents {
     /// The SHA-256 of each scene's file, by the scene's name.
     pub checksums: BTreeMap<String, String>,
-    /// A line for each scene in the manifest's order: what a run's numbers depend on.
+    /// What a run's numbers depend on: a line for each scene in the manifest's order, and channel layouts
+    /// that differ from the default.
     pub text: String,
 }
 
 impl DataContents {
-    /// The contents of the data set in `root`.
+    /// The contents of the data set in `root`, read with `layout`, a preset or a file.
     ///
     /// # Errors
-    /// A manifest or a file that cannot be read.
-    pub fn of(root: &Path) -> Result<Self, demc_data::Error> {
+    /// A layout, manifest, or file that cannot be read.
+    pub fn of(root: &Path, layout: &str) -> Result<Self, demc_data::Error> {
         let scenes = Dataset::list(root)?;
         let checksums = checksums(scenes.iter())?;
+        let of_set = ChannelLayout::resolve(layout)?;
+        let is_default = of_set == ChannelLayout::resolve(&DataConfig::default().layout)?;
+        let layouts = scenes.iter().filter_map(|scene| scene.layout.as_ref());
+        let layouts = layouts.chain((!is_default).then_some(&of_set));
+        let layouts = layouts.map(|layout| json!(layout).to_string() + "\n");
         let lines = scenes.iter().map(|scene| {
             let Scene {
                 name,
@@ -87,7 +94,7 @@ impl DataContents {
             format!("{}  {name}  {split}  {base}  {repeat}\n", checksums[name])
         });
         Ok(Self {
-            text: lines.collect(),
+            text: lines.chain(layouts).collect(),
             checksums,
         })
     }

@@ -169,6 +169,19 @@ fn an_ablation_resumes_from_its_results_and_remakes_its_tables() {
         "files of scenes changed since the run started: gen-room-test-1",
     );
 
+    // Nor do runs with another channel layout, neither from their directories nor from the results.
+    let layout = ["--set", "data.layout=mitsuba3"];
+    let error = error_line(&run(&[&args[..], &layout].concat()), 1);
+    says(&error, "data.layout: mitsuba3 instead of demc-exr");
+    for entry in fs::read_dir(&out).expect("runs") {
+        let path = entry.expect("a run").path();
+        if path.is_dir() {
+            fs::remove_dir_all(path).expect("a run");
+        }
+    }
+    let error = error_line(&run(&[&args[..], &layout].concat()), 1);
+    says(&error, "no channel");
+
     // The results alone make all tables.
     let alone = dir.path().join("alone");
     fs::create_dir(&alone).expect("a directory");

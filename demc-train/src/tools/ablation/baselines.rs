@@ -13,7 +13,7 @@ use demc_program::checksum::{sha256, sha256_of};
 
 use super::results::{self, ImageValue, RESULTS, ScoredRun};
 use super::spec::{AblationSpec, Baseline};
-use super::{DataFiles, values_of};
+use super::{DataFiles, data_key, values_of};
 use crate::config::HASH_DIGITS;
 use crate::record::progress::say;
 
@@ -47,7 +47,7 @@ pub(super) fn scored(spec: &AblationSpec, files: &DataFiles) -> anyhow::Result<V
             ));
             continue;
         }
-        let hash = images.hash(&scenes, &files[&data.root].checksums)?;
+        let hash = images.hash(&scenes, &files[&data_key(data)].checksums)?;
         let is_own = |run: &ScoredRun| run.variant == baseline.name;
         let is_same = |run: &&ScoredRun| is_own(run) && run.configuration == hash;
         let scores = match stored.iter().find(is_same) {

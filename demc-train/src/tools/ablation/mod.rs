@@ -19,6 +19,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
+use demc_data::DataConfig;
 use demc_infer::BundleFile;
 use demc_infer::evaluate::{ImageScore, Report};
 use demc_model::metrics::METRICS;
@@ -138,15 +139,20 @@ fn planned(spec: &AblationSpec) -> Vec<PlannedRun> {
     runs.collect()
 }
 
-/// The contents of each data set, by its directory.
-type DataFiles = BTreeMap<PathBuf, DataContents>;
+/// The contents of each data set, by its directory and channel layout.
+type DataFiles = BTreeMap<(PathBuf, String), DataContents>;
+
+fn data_key(data: &DataConfig) -> (PathBuf, String) {
+    (data.root.clone(), data.layout.clone())
+}
 
 fn data_files(spec: &AblationSpec) -> anyhow::Result<DataFiles> {
     let mut files = DataFiles::new();
     for variant in &spec.variants {
-        let root = &variant.config.data.root;
-        if !files.contains_key(root) {
-            files.insert(root.clone(), DataContents::of(root)?);
+        let key = data_key(&variant.config.data);
+        if !files.contains_key(&key) {
+            let contents = DataContents::of(&key.0, &key.1)?;
+            files.insert(key, contents);
         }
     }
     Ok(files)
@@ -168,7 +174,7 @@ fn collect(
     for run in planned {
         let is_stored =
             |row: &ScoredRun| row.variant == run.variant && row.seed == run.config.train.seed;
-        let data = &files[&run.config.data.root];
+        let data = &files[&data_key(&run.config.data)];
         let hash = run.config.hash(&data.text);
         let is_same = |row: &&ScoredRun| is_stored(row) && row.configuration == hash;
         let in_file = || Some((stored.iter().find(is_same)?.clone(), path.as_path()));
@@ -272,7 +278,13 @@ fn finished(run: &PlannedRun, data: &DataContents) -> anyhow::Result<Option<Scor
         return Ok(None);
     }
     let saved = Config::load(&dir.join("config.toml"), &[])?;
-    let differences = config.differences(&saved);
+    let mut differences = config.differences(&saved);
+    if config.data.layout != saved.data.layout {
+        differences.push(format!(
+            "data.layout: {} instead of {}",
+            config.data.layout, saved.data.layout
+        ));
+    }
     ensure!(
         differences.is_empty(),
         "{}: contains a run with another configuration: {}; undo the edit, or name another directory with --run-dir",
