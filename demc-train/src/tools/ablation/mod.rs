@@ -15,6 +15,7 @@ pub mod spec;
 mod table;
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -149,10 +150,9 @@ fn data_key(data: &DataConfig) -> (PathBuf, String) {
 fn data_files(spec: &AblationSpec) -> anyhow::Result<DataFiles> {
     let mut files = DataFiles::new();
     for variant in &spec.variants {
-        let key = data_key(&variant.config.data);
-        if !files.contains_key(&key) {
-            let contents = DataContents::of(&key.0, &key.1)?;
-            files.insert(key, contents);
+        let data = &variant.config.data;
+        if let Entry::Vacant(entry) = files.entry(data_key(data)) {
+            entry.insert(DataContents::of(&data.root, &data.layout)?);
         }
     }
     Ok(files)
