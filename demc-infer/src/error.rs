@@ -96,8 +96,10 @@ pub enum DenoiseError {
 pub enum LayersError {
     /// The network makes colours instead of kernels.
     #[error(
-        "layers need a model with model.head = \"{}\", whose kernels filter them; this one has \"{}\"",
+        "layers need a model with model.head = \"{}\" or \"{}\", whose kernels filter them; this \
+         one has \"{}\"",
         Head::Kernel.name(),
+        Head::Mixed.name(),
         found.name()
     )]
     Head { found: Head },

@@ -123,10 +123,13 @@ impl Denoiser {
         }
     }
 
-    /// Whether the network filters layers of the image, too: whether it has a kernel head.
+    /// Whether the network filters layers of the image, too: whether its head predicts kernels.
     pub fn filters_layers(&self) -> bool {
-        self.dual_encoder()
-            .is_some_and(|network| network.decoder.head.is_none())
+        match &self.body {
+            Body::DualEncoder(network) => network.decoder.head.is_none(),
+            Body::Unet(network) => network.mixed.is_some(),
+            Body::Kpcn(_) => false,
+        }
     }
 
     /// Visits all parameters. Their paths are the names of the weights, without the body's.

@@ -26,15 +26,15 @@ impl Denoiser {
         done.expect("nobody cancels").0
     }
 
-    /// As [`forward`](Self::forward), for one image without autodiff. The kernels of a kernel head
-    /// also filter `layers`, which are divided by the albedo as the colour is, but stay linear.
+    /// As [`forward`](Self::forward), for one image without autodiff. The kernels of a kernel head or a
+    /// mixed one also filter `layers`, which are divided by the albedo as the colour is, but stay linear.
     ///
     /// # Shapes
     /// `color` `[1, 3, H, W]`, `features` `[1, 12, H, W]`, `layers` `[L, 3, H, W]` in linear
     /// light, of either sign. Returns the denoised `color` and `layers`.
     ///
     /// # Panics
-    /// If the tensors have other shapes, or the network has no kernel head.
+    /// If the tensors have other shapes, or the network has no kernels.
     pub fn forward_with_layers(
         &self,
         color: Tensor<4>,
@@ -44,7 +44,7 @@ impl Denoiser {
         let layers = Some(layers);
         let done = self.forward_observed(color, features, layers, &mut never_cancelled);
         let (color, layers) = done.expect("nobody cancels");
-        (color, layers.expect("a kernel head filters layers"))
+        (color, layers.expect("kernels filter layers"))
     }
 
     /// As [`forward`](Self::forward) or [`forward_with_layers`](Self::forward_with_layers). On the
@@ -79,15 +79,14 @@ impl Denoiser {
             Body::Unet(network)
                 if network.side.is_none() && self.infers_on(&network.device(), &color.device()) =>
             {
-                let out = inference::forward_unet(network, color, features, observer)?;
-                Ok((out, None))
+                inference::forward_unet(network, [color, features], layers, observer)
             }
-            Body::Unet(network) => Ok((network.forward(color, features, self.ops()), None)),
+            Body::Unet(network) => Ok(network.forward([color, features], layers, self.ops())),
         }
     }
 
     fn assert_layers(&self, color: [usize; 4], layers: [usize; 4]) {
-        assert!(self.filters_layers(), "layers need a kernel head");
+        assert!(self.filters_layers(), "layers need kernels");
         let [batch, colors, height, width] = color;
         let [count, ..] = layers;
         assert!(batch == 1 && count > 0, "layers of one image");

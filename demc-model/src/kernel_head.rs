@@ -58,28 +58,32 @@ pub(crate) fn forward(
     color_gamma: Maps,
     layers: Option<Maps>,
 ) -> (Maps, Option<Maps>) {
-    let has_layers = layers.is_some();
-    let images = color_gamma.radiance(GAMMA);
-    let images = match layers {
-        None => images,
-        Some(layers) => Maps::cat_images(vec![images, layers]),
-    };
-    let out = filtered(kernels, decoded, images);
-    let (color, layers) = if has_layers {
-        let (color, layers) = out.split_first();
-        (color, Some(layers))
-    } else {
-        (out, None)
-    };
+    let (color, layers) = filtered(kernels, decoded, color_gamma.radiance(GAMMA), layers);
     (color.gamma(GAMMA, DARKEST), layers)
 }
 
-/// Images in linear light, filtered on all scales.
+/// Colour and layers in linear light, filtered on all scales.
 ///
 /// # Shapes
-/// `decoded`: the decoder's maps, deepest first, of which the last [`KERNEL_LEVELS`] count. Images
-/// `[B, 3, H, W]` to the same.
-pub(crate) fn filtered(kernels: &[Conv2d], decoded: Vec<Maps>, images: Maps) -> Maps {
+/// `decoded`: the decoder's maps, deepest first, of which the last [`KERNEL_LEVELS`] count. Colour
+/// `[B, 3, H, W]` and layers `[L, 3, H, W]`, for B = 1, to the same.
+pub(crate) fn filtered(
+    kernels: &[Conv2d],
+    decoded: Vec<Maps>,
+    color: Maps,
+    layers: Option<Maps>,
+) -> (Maps, Option<Maps>) {
+    match layers {
+        None => (filtered_images(kernels, decoded, color), None),
+        Some(layers) => {
+            let images = Maps::cat_images(vec![color, layers]);
+            let (color, layers) = filtered_images(kernels, decoded, images).split_first();
+            (color, Some(layers))
+        }
+    }
+}
+
+fn filtered_images(kernels: &[Conv2d], decoded: Vec<Maps>, images: Maps) -> Maps {
     let mut scales = vec![images];
     for _ in 1..KERNEL_LEVELS {
         scales.push(scales[scales.len() - 1].clone().halve());

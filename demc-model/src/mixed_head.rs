@@ -41,16 +41,24 @@ impl MixedHead {
         Ok(MixedHead { kernels, gate })
     }
 
-    /// The blended image.
+    /// The blended image, and the layers filtered with the kernels.
     ///
     /// # Shapes
     /// `direct` and the noisy `color` `[B, 3, H, W]` in the network's space; `decoded`: the decoder's maps,
-    /// deepest first. Returns the shape of `direct`.
-    pub fn forward(&self, direct: Maps, decoded: Vec<Maps>, color: Maps) -> Maps {
+    /// deepest first; layers `[L, 3, H, W]` in linear light, for B = 1. Returns the shapes of `direct` and
+    /// the layers.
+    pub fn forward(
+        &self,
+        direct: Maps,
+        decoded: Vec<Maps>,
+        color: Maps,
+        layers: Option<Maps>,
+    ) -> (Maps, Option<Maps>) {
         let last = decoded.last().expect("a decoder has levels").clone();
         let gate = last.conv1x1(&self.gate).sigmoid();
-        let filtered = kernel_head::filtered(&self.kernels, decoded, color.pu_radiance());
-        direct.mix(filtered.pu_color(), gate)
+        let color = color.pu_radiance();
+        let (filtered, layers) = kernel_head::filtered(&self.kernels, decoded, color, layers);
+        (direct.mix(filtered.pu_color(), gate), layers)
     }
 }
 

@@ -114,12 +114,18 @@ impl Unet {
         Some(fusion.forward(Maps::from_nchw(features, ops)).into_nchw())
     }
 
-    /// Denoises colour with guides, both in OIDN's value ranges.
+    /// Denoises colour with guides, both in OIDN's value ranges, and layers with the kernels of a mixed head.
     ///
     /// # Shapes
     /// `color` `[B, 3, H, W]`; `features` `[B, 12, H, W]`, of which the guides count, with a second encoder
-    /// all; H and W multiples of 16. Returns the shape of `color`, not negative.
-    pub fn forward(&self, color: Tensor<4>, features: Tensor<4>, ops: Ops) -> Tensor<4> {
+    /// all; H and W multiples of 16; `layers` `[L, 3, H, W]` in linear light, for B = 1. Returns the shapes of
+    /// `color`, not negative, and `layers`.
+    pub fn forward(
+        &self,
+        [color, features]: [Tensor<4>; 2],
+        layers: Option<Tensor<4>>,
+        ops: Ops,
+    ) -> (Tensor<4>, Option<Tensor<4>>) {
         let side = self
             .side
             .as_ref()
@@ -145,10 +151,13 @@ impl Unet {
             decoded.push(x.clone());
         }
         let direct = x.conv3x3(&self.head, Activation::Relu);
-        let out = match &self.mixed {
-            Some(mixed) => mixed.forward(direct, decoded, Maps::from_nchw(color, ops)),
-            None => direct,
+        let (out, layers) = match &self.mixed {
+            Some(mixed) => {
+                let layers = layers.map(|layers| Maps::from_nchw(layers, ops));
+                mixed.forward(direct, decoded, Maps::from_nchw(color, ops), layers)
+            }
+            None => (direct, None),
         };
-        out.into_nchw()
+        (out.into_nchw(), layers.map(Maps::into_nchw))
     }
 }

@@ -176,8 +176,8 @@ void demcReleaseFilter(DemcFilter filter);
 //
 // "color" and "output" are required, and the features as the model needs them. The bundled models
 // need normal and albedo. Without position, they use zeros; without albedo2, the albedo. Layers
-// need a model with a kernel head, as the bundled ones have. A layer of 3 channels is light, and one of
-// 1 channel is a mask.
+// need a model with a kernel head, as the bundled ones have, or a mixed one. A layer of 3 channels is
+// light, and one of 1 channel is a mask.
 //
 // `data` is the caller's memory. It must stay valid until the last execution with it has ended. An
 // output may be the same image as an input, because outputs are written last.

@@ -96,7 +96,7 @@ class Model:
 
     @property
     def takes_layers(self) -> bool:
-        """Whether `denoise` accepts layers: the network has a kernel head."""
+        """Whether `denoise` accepts layers: the network predicts kernels."""
         return self._bundle.takes_layers()
 
     def input_scale(self, color: ArrayLike) -> float:

@@ -20,11 +20,16 @@ pub(crate) fn bundle(variant: Variant) -> Bundle {
 
 /// The network of [`bundle`] with a kernel head, whose kernels differ from pixel to pixel.
 pub(crate) fn kernel_bundle() -> Bundle {
-    let mut bundle = bundle_with(Variant::Demc, Head::Kernel);
+    bundle_with_kernels(Variant::Demc, Head::Kernel)
+}
+
+/// A model whose head predicts random kernels.
+pub(crate) fn bundle_with_kernels(variant: Variant, head: Head) -> Bundle {
+    let mut bundle = bundle_with(variant, head);
     let mut rng = ChaCha8Rng::seed_from_u64(9);
     let mut weights = bundle.model.weights();
     for weight in &mut weights {
-        if weight.name.starts_with("decoder.kernels") {
+        if weight.name.starts_with("decoder.kernels") || weight.name.starts_with("mixed.") {
             let random = |value: &mut f32| *value = rng.random_range(-2.0..2.0);
             weight.data.iter_mut().for_each(random);
         }

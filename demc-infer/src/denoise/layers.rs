@@ -4,6 +4,9 @@
 //! A kernel head is linear in the colour for given kernels, K. A layer x becomes `a K(x / a)`, with the
 //! albedo `a` of its colour channel as in albedo demodulation, or with `a` = 1. So layers whose sum is
 //! the colour still add up to it. Layers are neither clamped nor scaled.
+//!
+//! The image of a mixed head, y, is that of its kernels only in part. There a layer becomes
+//! `K(x) y / K(c)`, with its channel of the noisy colour c. So layers add up to the image again.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use demc_model::Head;
@@ -42,16 +45,25 @@ impl Bundle {
     /// Whether this model can filter layers with this number of passes.
     ///
     /// # Errors
-    /// It has no kernel head, or there are several passes.
+    /// Its head predicts no kernels, or there are several passes.
     pub fn check_layers(&self, ensemble: Ensemble) -> Result<(), LayersError> {
         let found = self.meta.model.head;
         match (found, ensemble) {
-            (Head::Kernel, Ensemble::One) => Ok(()),
-            (Head::Kernel, _) => Err(LayersError::Ensemble {
+            (Head::Kernel | Head::Mixed, Ensemble::One) => Ok(()),
+            (Head::Kernel | Head::Mixed, _) => Err(LayersError::Ensemble {
                 count: ensemble.count(),
             }),
             _ => Err(LayersError::Head { found }),
         }
+    }
+
+    /// Number of images of three channels that the kernels filter for this number of layers.
+    pub(super) fn layer_images(&self, layers: usize) -> usize {
+        let colors = match self.meta.model.head {
+            Head::Mixed if layers > 0 => COLOR_CHANNELS,
+            _ => 0,
+        };
+        (layers + colors).div_ceil(COLOR_CHANNELS)
     }
 }
 
@@ -67,14 +79,11 @@ pub(super) fn check_layer_sizes(layers: &[Layer], expected: usize) -> Result<(),
     })
 }
 
-/// Number of images of three channels that hold this number of layers.
-pub(super) fn layer_images(layers: usize) -> usize {
-    layers.div_ceil(COLOR_CHANNELS)
-}
-
 /// The layers of a tile, and their factors after the network.
 pub(super) struct LayerTile<'a> {
     layers: &'a [Layer],
+    /// The noisy colour `[3, H, W]` for a mixed head, whose image the layers add up to.
+    color: Option<&'a [f32]>,
     /// The factor of albedo demodulation, in gamma space, `[3, rows, columns]`.
     modulation: Option<&'a [f32]>,
     gamma: f32,
@@ -85,12 +94,14 @@ pub(super) struct LayerTile<'a> {
 impl<'a> LayerTile<'a> {
     pub(super) fn new(
         layers: &'a [Layer],
+        color: Option<&'a [f32]>,
         modulation: Option<&'a [f32]>,
         gamma: f32,
         [rows, columns]: [&PixelRange; 2],
     ) -> Self {
         LayerTile {
             layers,
+            color,
             modulation,
             gamma,
             rows: rows.clone(),
@@ -102,35 +113,62 @@ impl<'a> LayerTile<'a> {
         self.rows.len() * self.columns.len()
     }
 
-    /// The network's input: layers divided by the albedo, and planes of zeros to whole images.
+    /// The network's input: layers divided by the albedo, for a mixed head the noisy colour, and planes of
+    /// zeros to whole images.
     ///
     /// # Shapes
     /// Returns `[images, 3, rows, columns]`.
     pub(super) fn input(&self, padding: Padding, device: &Device) -> Tensor<4> {
-        let images = layer_images(self.layers.len());
-        let mut planes = Vec::with_capacity(images * COLOR_CHANNELS * self.pixels());
-        for layer in self.layers {
+        let samples = self.layers.iter().map(|layer| layer.samples.as_slice());
+        let mut planes = Vec::new();
+        for samples in samples.chain(self.color) {
             let (rows, columns) = (self.rows.clone(), self.columns.clone());
-            planes.extend(padding.cut(&layer.samples, rows, columns));
+            planes.extend(padding.cut(samples, rows, columns));
         }
-        self.for_each_albedo(&mut planes, |value, albedo| *value /= albedo);
+        let images = planes.len().div_ceil(COLOR_CHANNELS * self.pixels());
+        self.for_each_factor(&mut planes, self.albedo(), |value, albedo| *value /= albedo);
         planes.resize(images * COLOR_CHANNELS * self.pixels(), 0.0);
         let shape = [images, COLOR_CHANNELS, self.rows.len(), self.columns.len()];
         Tensor::from_data(TensorData::new(planes, shape), device)
     }
 
-    /// The layers of the network's output, multiplied by the albedo.
+    /// The layers of the network's output, multiplied by the albedo, for a mixed head by the ratio of the
+    /// image to the filtered colour.
     ///
     /// # Shapes
-    /// `[images, 3, rows, columns]` to `[layers, rows, columns]`.
-    pub(super) fn output(&self, mut planes: Vec<f32>) -> Vec<f32> {
-        planes.truncate(self.layers.len() * self.pixels());
-        self.for_each_albedo(&mut planes, |value, albedo| *value *= albedo);
+    /// `[images, 3, rows, columns]` and the denoised image `[3, rows, columns]` to `[layers, rows, columns]`.
+    pub(super) fn output(&self, mut planes: Vec<f32>, denoised: &[f32]) -> Vec<f32> {
+        let mut others = planes.split_off(self.layers.len() * self.pixels());
+        self.for_each_factor(&mut planes, self.albedo(), |value, albedo| *value *= albedo);
+        if self.color.is_some() {
+            others.truncate(denoised.len());
+            let ratios = others.par_iter_mut().zip(denoised);
+            ratios.for_each(|(filtered, denoised)| {
+                *filtered = if *filtered > 0.0 {
+                    *denoised / *filtered
+                } else {
+                    1.0
+                };
+            });
+            self.for_each_factor(&mut planes, Some(others), |value, ratio| *value *= ratio);
+        }
         planes
     }
 
-    fn for_each_albedo(&self, planes: &mut [f32], change: impl Fn(&mut f32, f32) + Sync) {
-        let Some(modulation) = self.modulation else {
+    /// The factor of albedo demodulation in linear light.
+    fn albedo(&self) -> Option<Vec<f32>> {
+        let modulation = self.modulation?.par_iter();
+        Some(modulation.map(|factor| factor.powf(self.gamma)).collect())
+    }
+
+    /// Changes each pixel of the layers by its colour's factor, `[3, rows, columns]`.
+    fn for_each_factor(
+        &self,
+        planes: &mut [f32],
+        factors: Option<Vec<f32>>,
+        change: impl Fn(&mut f32, f32) + Sync,
+    ) {
+        let Some(factors) = factors else {
             return;
         };
         let pixels = self.pixels();
@@ -139,9 +177,9 @@ impl<'a> LayerTile<'a> {
             let Some(color) = layer.color() else {
                 return;
             };
-            let factors = &modulation[color * pixels..(color + 1) * pixels];
+            let factors = &factors[color * pixels..(color + 1) * pixels];
             for (value, factor) in plane.iter_mut().zip(factors) {
-                change(value, factor.powf(self.gamma));
+                change(value, *factor);
             }
         });
     }

@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
 use super::*;
-use crate::bundle::testing::{bundle, filtered, frame, kernel_bundle};
+use crate::bundle::testing::{bundle, bundle_with_kernels, filtered, frame, kernel_bundle};
 
 /// Share of the largest value, as documented.
 const TOLERANCE: f32 = 1e-4;
@@ -64,9 +64,20 @@ fn difference(found: &[f32], expected: &[f32]) -> f32 {
     largest(differences) / largest(&mut expected.iter().map(|x| x.abs()))
 }
 
-/// Whole and in tiles, of sizes with padding, with the kernels and with Burn's operations.
 #[test]
 fn layers_that_add_up_to_the_colour_still_do() {
+    check_sums(model);
+}
+
+#[test]
+fn layers_of_a_mixed_head_add_up_to_its_image() {
+    for variant in [Variant::Unet, Variant::UnetDemc] {
+        check_sums(|| bundle_with_kernels(variant, Head::Mixed));
+    }
+}
+
+/// Whole and in tiles, of sizes with padding, with the kernels and with Burn's operations.
+fn check_sums(model: impl Fn() -> Bundle) {
     let tiled = Tiling {
         side: Some(224),
         ..Tiling::default()

@@ -30,7 +30,7 @@ use crate::padding::Padding;
 use crate::tiles::{Tiles, Tiling};
 use crate::{Bundle, memory};
 use input::FrameInput;
-use layers::{check_layer_sizes, layer_images};
+use layers::check_layer_sizes;
 
 pub use crate::error::{DenoiseError, LayersError};
 pub use demc_data::input::transform::MAX_INPUT_SCALE;
@@ -58,8 +58,8 @@ pub struct DenoiseOptions {
     pub input_scale: Option<f32>,
     /// Whether the output gets the light of the noisy image. `None`: as the model says.
     pub restore_light: Option<bool>,
-    /// Further channels to filter with the colour's kernels. They need a kernel head, and
-    /// [`Ensemble::One`].
+    /// Further channels to filter with the colour's kernels. They need a kernel or mixed
+    /// head, and [`Ensemble::One`].
     pub layers: Vec<Layer>,
 }
 
@@ -273,7 +273,7 @@ impl Bundle {
         let colors = self.meta.model.variant.spec().color_channels;
         let extra = (planes * size_of::<f32>()) as u64
             + ensemble.bytes_per_pixel(colors + FEATURES, colors);
-        let images = layer_images(layers);
+        let images = self.layer_images(layers);
         let need = |height, width| {
             self.pass_bytes_with(images, height, width) + extra * (height * width) as u64
         };

@@ -170,8 +170,8 @@ fn what_cannot_be_filtered_is_one_line_and_nothing_is_written() {
             grey.path(),
             &["--layers", "*.A"],
             2,
-            "--layers: layers need a model with model.head = \"kernel\", whose kernels filter \
-             them; this one has \"grey\""
+            "--layers: layers need a model with model.head = \"kernel\" or \"mixed\", whose \
+             kernels filter them; this one has \"grey\""
                 .into(),
         ),
         (

@@ -37,7 +37,7 @@ pub fn pass_bytes(
     match config.variant {
         Variant::Kpcn => return kpcn_bytes(config, height * width),
         Variant::Unet if ops.has_fast_inference() => {
-            return unet_bytes(config, height, width);
+            return unet_bytes(config, height, width, layers);
         }
         variant if variant.is_unet() => {
             let [.., [_, below], _] = config.size.spec().decoder;

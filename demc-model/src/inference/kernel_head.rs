@@ -32,12 +32,13 @@ pub(super) struct KernelHead {
     out: Option<FeatureMaps>,
 }
 
-/// Images in linear light: planes in gamma space, and the layers `[layers, 3, H, W]` of a single image.
+/// Images in linear light: planes in the network's space, which `linearize` leaves, and the layers
+/// `[layers, 3, H, W]` of a single image.
 pub(super) fn linear_images(
-    isa: Isa,
     grid: Grid,
     color: &FlexTensor,
     layers: Option<Tensor<4>>,
+    linearize: impl FnOnce(&mut [f32]),
 ) -> FeatureMaps {
     let count = layers.as_ref().map_or(0, |layers| layers.dims()[0]);
     let all = Grid {
@@ -47,7 +48,7 @@ pub(super) fn linear_images(
     let mut images = FeatureMaps::new(all, COLOR_CHANNELS);
     let (colors, others) = images.values.split_at_mut(grid.pixels() * COLOR_CHANNELS);
     grid::nhwc_from_nchw(grid, color.storage::<f32>(), colors);
-    power::positive_powers(isa, colors, GAMMA);
+    linearize(colors);
     if let Some(layers) = layers.map(host) {
         let grid = Grid {
             batch: count,
@@ -170,12 +171,15 @@ impl KernelHead {
             }
         });
         power::positive_powers(isa, colors, 1.0 / GAMMA);
-        let planar = |batch: usize, values: &[f32]| {
-            let mut planar = memory::buffer(values.len());
-            grid::nchw_from_nhwc(Grid { batch, ..out.grid }, values, &mut planar);
-            planar
-        };
-        let filtered = (layers > 0).then(|| planar(layers, others));
-        (planar(batch, colors), filtered)
+        let filtered = (layers > 0).then(|| planar(out.grid, others));
+        (planar(out.grid, colors), filtered)
     }
+}
+
+/// The planes of images on `grid`, whatever their number.
+pub(super) fn planar(grid: Grid, values: &[f32]) -> Vec<f32> {
+    let batch = values.len() / (grid.height * grid.width * COLOR_CHANNELS);
+    let mut planar = memory::buffer(values.len());
+    grid::nchw_from_nhwc(Grid { batch, ..grid }, values, &mut planar);
+    planar
 }

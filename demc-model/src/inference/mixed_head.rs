@@ -3,13 +3,14 @@
 use std::ops::Range;
 
 use burn::backend::flex::FlexTensor;
+use burn::tensor::Tensor;
 use demc_kernels::conv1x1::{Epilogue, Part, forward_part};
-use demc_kernels::{Grid, Isa, grid, pu};
+use demc_kernels::{Grid, Isa, pu};
 use rayon::prelude::*;
 
 use super::feature_maps::FeatureMaps;
 use super::folded::FoldedConv;
-use super::kernel_head::KernelHead;
+use super::kernel_head::{KernelHead, linear_images, planar};
 use crate::config::COLOR_CHANNELS;
 use crate::mixed_head::MixedHead;
 use crate::pu::BRIGHTEST;
@@ -24,15 +25,22 @@ pub(super) struct MixedPass {
 }
 
 impl MixedPass {
-    /// The head for planes in the network's space.
-    pub(super) fn new(isa: Isa, head: &MixedHead, grid: Grid, color: &FlexTensor) -> Self {
-        let mut images = FeatureMaps::new(grid, COLOR_CHANNELS);
-        grid::nhwc_from_nchw(grid, color.storage::<f32>(), &mut images.values);
-        let peak = pu::value(pu::PEAK);
-        images.values.par_iter_mut().for_each(|value| {
-            *value = pu::inverse((*value * peak).clamp(0.0, BRIGHTEST * peak));
+    /// The head for planes in the network's space, and layers `[layers, 3, H, W]` of a single image.
+    pub(super) fn new(
+        isa: Isa,
+        head: &MixedHead,
+        grid: Grid,
+        color: &FlexTensor,
+        layers: Option<Tensor<4>>,
+    ) -> Self {
+        let images = linear_images(grid, color, layers, |colors| {
+            let peak = pu::value(pu::PEAK);
+            colors.par_iter_mut().for_each(|value| {
+                *value = pu::inverse((*value * peak).clamp(0.0, BRIGHTEST * peak));
+            });
         });
-        let kernels = KernelHead::new(isa, &head.kernels, images, 0);
+        let layers = images.grid.batch - grid.batch;
+        let kernels = KernelHead::new(isa, &head.kernels, images, layers);
         MixedPass {
             isa,
             filtered: kernels.filtered(0),
@@ -64,8 +72,8 @@ impl MixedPass {
             .filter_rows(0, image, rows, decoded, &mut self.filtered);
     }
 
-    /// Blends the filtered image into the planes of the direct one.
-    pub(super) fn blend(mut self, direct: &mut [f32]) {
+    /// Blends the filtered image into the planes of the direct one. Returns the planes of the layers, if any.
+    pub(super) fn blend(mut self, direct: &mut [f32]) -> Option<Vec<f32>> {
         self.kernels.blend(self.filtered);
         let filtered = self.kernels.into_images();
         let Grid { height, width, .. } = filtered.grid;
@@ -82,5 +90,7 @@ impl MixedPass {
                 *value += (color - *value) / (1.0 + (-logit).exp());
             }
         });
+        let layers = &filtered.values[direct.len()..];
+        (!layers.is_empty()).then(|| planar(filtered.grid, layers))
     }
 }

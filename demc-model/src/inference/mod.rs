@@ -36,11 +36,12 @@ use burn::backend::flex::FlexTensor;
 use burn::nn::conv::Conv2d;
 use burn::tensor::{Tensor, TensorData};
 use demc_kernels::conv3x3::Tile;
-use demc_kernels::{Isa, grid, memory};
+use demc_kernels::{Isa, grid, memory, power};
 
 use crate::config::{COLOR_CHANNELS, LEVELS};
 use crate::decoder::Decoder;
 use crate::dual_encoder::DualEncoder;
+use crate::kernel_head::GAMMA;
 use encoder::{DEEPEST_BANDED, folded_block};
 use feature_maps::FeatureMaps;
 use full_resolution::{SkipSources, UPPER_LEVELS};
@@ -87,21 +88,22 @@ fn forward_with(
     let color = model.decoder.head.is_none().then(|| images.color());
     let encoded = pass.encode(images)?;
     let head = color.map(|color| {
-        let images = linear_images(pass.isa, grid, &color, layers);
+        let images = linear_images(grid, &color, layers, |colors| {
+            power::positive_powers(pass.isa, colors, GAMMA);
+        });
         let layers = images.grid.batch - batch;
         KernelHead::new(pass.isa, &model.decoder.kernels, images, layers)
     });
     let (out, layers) = pass.decode(encoded, head)?;
-    let tensor = |planes: Vec<f32>, images: usize| {
-        let shape = [images, COLOR_CHANNELS, height, width];
-        Tensor::from_primitive::<Flex>(FlexTensor::from_data(TensorData::new(planes, shape)))
-    };
-    let image = COLOR_CHANNELS * height * width;
-    let layers = layers.map(|layers| {
-        let images = layers.len() / image;
-        tensor(layers, images)
-    });
-    Ok((tensor(out, batch), layers))
+    let layers = layers.map(|layers| images_of(layers, height, width));
+    Ok((images_of(out, height, width), layers))
+}
+
+/// Planes as a tensor `[B, 3, H, W]`.
+fn images_of(planes: Vec<f32>, height: usize, width: usize) -> Tensor<4> {
+    let batch = planes.len() / (COLOR_CHANNELS * height * width);
+    let data = TensorData::new(planes, [batch, COLOR_CHANNELS, height, width]);
+    Tensor::from_primitive::<Flex>(FlexTensor::from_data(data))
 }
 
 struct EncodedImages {

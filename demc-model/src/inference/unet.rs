@@ -5,9 +5,8 @@
 
 use std::ops::Range;
 
-use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
-use burn::tensor::{Tensor, TensorData};
+use burn::tensor::Tensor;
 use demc_kernels::conv3x3::{PreparedConvolution, Tile};
 use demc_kernels::{Grid, Isa, double, memory, pool};
 use rayon::prelude::*;
@@ -17,6 +16,7 @@ use super::feature_maps::FeatureMaps;
 use super::folded::FoldedConv;
 use super::full_resolution::write_rows;
 use super::images::host;
+use super::images_of;
 use super::mixed_head::MixedPass;
 use super::pass::BandPlan;
 use super::watch::{Cancelled, Observer, Watch};
@@ -27,21 +27,20 @@ use crate::unet::{UNET_LEVELS, Unet};
 /// As [`Unet::forward`], on the host without autodiff.
 pub(crate) fn forward(
     network: &Unet,
-    color: Tensor<4>,
-    features: Tensor<4>,
+    [color, features]: [Tensor<4>; 2],
+    layers: Option<Tensor<4>>,
     observer: &mut Observer,
-) -> Result<Tensor<4>, Cancelled> {
-    let [batch, _, height, width] = color.dims();
+) -> Result<(Tensor<4>, Option<Tensor<4>>), Cancelled> {
+    let [_, _, height, width] = color.dims();
     let input = Input::new(network, color, features);
     let pass = UnetPass {
         plan: BandPlan::new(width),
         tile: Tile::F4,
         watch: &Watch::new(input.grid, observer),
     };
-    let planes = pass.forward(network, &input)?;
-    let shape = [batch, COLOR_CHANNELS, height, width];
-    let data = TensorData::new(planes, shape);
-    Ok(Tensor::from_primitive::<Flex>(FlexTensor::from_data(data)))
+    let (out, layers) = pass.forward(network, &input, layers)?;
+    let layers = layers.map(|layers| images_of(layers, height, width));
+    Ok((images_of(out, height, width), layers))
 }
 
 /// The planes of colour and guides.
@@ -110,13 +109,19 @@ struct UnetPass<'a> {
 }
 
 impl UnetPass<'_> {
-    /// Returns the planes of the images.
-    fn forward(&self, network: &Unet, input: &Input) -> Result<Vec<f32>, Cancelled> {
+    /// Returns the planes of the images, and of the layers that a mixed head filters.
+    fn forward(
+        &self,
+        network: &Unet,
+        input: &Input,
+        layers: Option<Tensor<4>>,
+    ) -> Result<(Vec<f32>, Option<Vec<f32>>), Cancelled> {
         let grid = input.grid;
         // The input of each encoder level but the first, which is the skip of the decoder's.
         let mut skips: Vec<FeatureMaps> = Vec::with_capacity(UNET_LEVELS);
         let mixed = network.mixed.as_ref();
-        let mut mixed = mixed.map(|head| MixedPass::new(Isa::current(), head, grid, &input.color));
+        let mut mixed =
+            mixed.map(|head| MixedPass::new(Isa::current(), head, grid, &input.color, layers));
         for (level, module) in network.encoder.iter().enumerate() {
             let grid = (0..level).fold(grid, |grid, _| grid.halved());
             let convs = folded(module);
@@ -195,10 +200,8 @@ impl UnetPass<'_> {
                 }
             },
         )?;
-        if let Some(mixed) = mixed {
-            mixed.blend(&mut planar);
-        }
-        Ok(planar)
+        let layers = mixed.and_then(|mixed| mixed.blend(&mut planar));
+        Ok((planar, layers))
     }
 
     /// A level's whole output.

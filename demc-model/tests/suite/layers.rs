@@ -141,7 +141,7 @@ fn the_kernels_filter_layers_as_burns_operations_do() {
 }
 
 #[test]
-#[should_panic(expected = "layers need a kernel head")]
+#[should_panic(expected = "layers need kernels")]
 fn a_head_that_makes_colour_filters_no_layers() {
     let config = ModelConfig {
         width: 1,
