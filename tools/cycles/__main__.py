@@ -11,8 +11,7 @@
                                                                      their test scenes, second edition
 
 Features are those that Cycles writes; the second albedo is a copy of the first. The same seed gives the same views but for
-rounding, except hair, which Blender does not always place in the same way. Existing images are kept: rerun a command
-to resume it.
+rounding. Existing images are kept: rerun a command to resume it.
 """
 
 from __future__ import annotations

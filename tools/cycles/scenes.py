@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import bpy
+import bmesh  # isort: skip (part of bpy)
 import numpy as np
 from mathutils import Vector
 from shading import BRICK, CELLS, CHECKER, MAGIC, NOISE, WAVE, Painter, Rng, Texture, logarithmic
@@ -29,7 +30,8 @@ def block(rng: Rng) -> bpy.types.Object:
 
 
 def ball(rng: Rng) -> bpy.types.Object:
-    bpy.ops.mesh.primitive_uv_sphere_add(radius=0.5, location=(0, 0, 0.5), segments=64, ring_count=32)
+    # Not a UV sphere: Blender places hair on it differently in each run.
+    bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=5, radius=0.5, location=(0, 0, 0.5))
     return smooth()
 
 
@@ -98,6 +100,17 @@ def pyramid(rng: Rng) -> bpy.types.Object:
 def smooth() -> bpy.types.Object:
     bpy.ops.object.shade_smooth()
     return bpy.context.object
+
+
+def triangulate(data: bpy.types.Mesh) -> None:
+    """Makes triangles of several kinds of polygons, on which Blender places hair differently in each run."""
+    if len({len(polygon.vertices) for polygon in data.polygons}) == 1:
+        return
+    mesh = bmesh.new()
+    mesh.from_mesh(data)
+    bmesh.ops.triangulate(mesh, faces=mesh.faces)
+    mesh.to_mesh(data)
+    mesh.free()
 
 
 @dataclass(frozen=True)
@@ -273,6 +286,7 @@ class Stage:
     def grow(self, thing: bpy.types.Object, count: int, length: float) -> None:
         """Hair of this length, in metres, on a mesh."""
         rng = self.rng
+        triangulate(thing.data)
         thing.data.materials.append(self.painter.hair())
         system = thing.modifiers.new("hair", "PARTICLE_SYSTEM").particle_system
         system.seed = int(rng.integers(1000))
