@@ -34,7 +34,7 @@ const OUTPUT: Tolerance = Tolerance {
 /// A Python with PyTorch and the package of `bindings/python/`.
 fn pytorch() -> Option<Python> {
     let install = "'./bindings/python[torch]'";
-    Python::with("torch, demc", install, "DEMC_REQUIRE_TORCH")
+    Python::with("torch, safetensors, demc", install, "DEMC_REQUIRE_TORCH")
 }
 
 #[test]
