@@ -237,10 +237,9 @@ impl<'a> FrameInput<'a> {
         });
         self.blank_padding(&mut color, rows, columns);
         let color_gamma = self.tensor::<COLOR_CHANNELS>(color, rows, columns);
-        let is_mixed = self.bundle.meta.model.head == Head::Mixed;
         let layers = LayerTile::new(
             self.layers,
-            is_mixed.then_some(self.color),
+            self.bundle.scales_layers().then_some(self.color),
             modulation.as_deref(),
             normalizer.gamma,
             [rows, columns],
@@ -261,8 +260,7 @@ impl<'a> FrameInput<'a> {
             out.iter_mut().for_each(|value| *value /= self.scale);
         });
         if let Some(filtered) = filtered {
-            let layers = layers.output(self.read(filtered)?, &out);
-            out.extend(layers);
+            out.extend(layers.output(self.read(filtered)?, &out));
         }
         Ok(out)
     }

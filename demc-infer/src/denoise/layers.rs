@@ -57,13 +57,15 @@ impl Bundle {
         }
     }
 
+    /// Whether layers are multiplied by the ratio of the image to the filtered colour: with a mixed head.
+    pub(super) fn scales_layers(&self) -> bool {
+        self.meta.model.head == Head::Mixed
+    }
+
     /// Number of images of three channels that the kernels filter for this number of layers.
     pub(super) fn layer_images(&self, layers: usize) -> usize {
-        let colors = match self.meta.model.head {
-            Head::Mixed if layers > 0 => COLOR_CHANNELS,
-            _ => 0,
-        };
-        (layers + colors).div_ceil(COLOR_CHANNELS)
+        let has_color = layers > 0 && self.scales_layers();
+        (layers + usize::from(has_color) * COLOR_CHANNELS).div_ceil(COLOR_CHANNELS)
     }
 }
 
@@ -144,11 +146,10 @@ impl<'a> LayerTile<'a> {
             others.truncate(denoised.len());
             let ratios = others.par_iter_mut().zip(denoised);
             ratios.for_each(|(filtered, denoised)| {
-                *filtered = if *filtered > 0.0 {
-                    *denoised / *filtered
-                } else {
-                    1.0
-                };
+                // A tiny filtered value overflows the ratio.
+                let ratio = *denoised / *filtered;
+                let is_valid = *filtered > 0.0 && ratio.is_finite();
+                *filtered = if is_valid { ratio } else { 1.0 };
             });
             self.for_each_factor(&mut planes, Some(others), |value, ratio| *value *= ratio);
         }

@@ -65,8 +65,8 @@ fn checksums<'a>(
 pub struct DataContents {
     /// The SHA-256 of each scene's file, by the scene's name.
     pub checksums: BTreeMap<String, String>,
-    /// What a run's numbers depend on: a line for each scene in the manifest's order, and channel layouts
-    /// that differ from the default.
+    /// What a run's numbers depend on: a line for each scene in the manifest's order, with its own channel
+    /// layout if it has one, and the data set's layout if that is not the default.
     pub text: String,
 }
 
@@ -80,21 +80,25 @@ impl DataContents {
         let checksums = checksums(scenes.iter())?;
         let of_set = ChannelLayout::resolve(layout)?;
         let is_default = of_set == ChannelLayout::resolve(&DataConfig::default().layout)?;
-        let layouts = scenes.iter().filter_map(|scene| scene.layout.as_ref());
-        let layouts = layouts.chain((!is_default).then_some(&of_set));
-        let layouts = layouts.map(|layout| json!(layout).to_string() + "\n");
+        let of_set = (!is_default).then(|| format!("{}\n", json!(of_set)));
         let lines = scenes.iter().map(|scene| {
             let Scene {
                 name,
                 split,
                 base,
                 repeat,
+                layout,
                 ..
             } = scene;
-            format!("{}  {name}  {split}  {base}  {repeat}\n", checksums[name])
+            let layout = layout.as_ref().map(|layout| format!("  {}", json!(layout)));
+            let layout = layout.unwrap_or_default();
+            format!(
+                "{}  {name}  {split}  {base}  {repeat}{layout}\n",
+                checksums[name]
+            )
         });
         Ok(Self {
-            text: lines.chain(layouts).collect(),
+            text: lines.chain(of_set).collect(),
             checksums,
         })
     }

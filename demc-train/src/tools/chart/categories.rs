@@ -59,13 +59,15 @@ fn ends(row: &Category) -> impl Iterator<Item = f64> {
     row.interval.into_iter().flatten().chain([row.value])
 }
 
-/// The value at which the axis of bars ends before its margin, if one bar is much longer than all others.
+/// The value at which the axis ends before its margin: infinite, unless one bar is much longer than all others.
 fn bars_limit(panel: &CategoryPanel) -> f64 {
     let longest = |row: &&Category| ends(row).fold(0.0, f64::max);
     let mut rows: Vec<&Category> = panel.rows.iter().collect();
     rows.sort_by(|a, b| longest(a).total_cmp(&longest(b)));
     match rows[..] {
-        [.., second, last] if last.value > CUT * longest(&second) => CUT * longest(&second),
+        [.., second, last] if panel.bars && last.value > CUT * longest(&second) => {
+            CUT * longest(&second)
+        }
         _ => f64::INFINITY,
     }
 }
@@ -74,11 +76,7 @@ fn draw_panel<B: DrawingBackend>(area: &Area<B>, panel: &CategoryPanel) -> DrawR
     let area = area
         .margin(EDGE, 0, 0, 0)
         .titled(&panel.title, font(SIZES[0]).color(&INK))?;
-    let limit = if panel.bars {
-        bars_limit(panel)
-    } else {
-        f64::INFINITY
-    };
+    let limit = bars_limit(panel);
     let zero = panel.bars.then_some(0.0);
     let ends = panel.rows.iter().flat_map(ends).map(|end| end.min(limit));
     let values = ends.chain(panel.line).chain(zero);
