@@ -7,6 +7,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
+use super::layers::LayerTile;
 use super::*;
 use crate::bundle::testing::{bundle, bundle_with_kernels, filtered, frame, kernel_bundle};
 
@@ -203,4 +204,19 @@ fn layers_that_cannot_be_filtered_are_refused() {
         error.to_string(),
         "layer lamp.R holds 63 values; the image has 64 pixels"
     );
+}
+
+#[test]
+fn a_tiny_filtered_colour_leaves_the_layers_finite() {
+    let layers = [Layer {
+        name: "key.R".into(),
+        samples: vec![0.0; 2],
+    }];
+    let color = [0.0; 6];
+    let tile = LayerTile::new(&layers, Some(&color), None, 2.2, [&(0..1), &(0..2)]);
+    // The layer, and the filtered colour: f32::MIN_POSITIVE / 4, then 0.5.
+    let tiny = f32::MIN_POSITIVE / 4.0;
+    let filtered = vec![0.0, 0.25, tiny, 0.5, 0.0, 0.0, 0.0, 0.0];
+    let found = tile.output(filtered, &[100.0, 1.0, 0.0, 0.0, 0.0, 0.0]);
+    assert_eq!(found, [0.0, 0.5]);
 }
