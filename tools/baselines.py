@@ -8,6 +8,9 @@ oidn             Intel's Open Image Denoise: HDR colour, noisy albedo (first hit
 oidn-prefilter   the same; albedo and normal are denoised first, as its documentation recommends
 oidn-fast, oidn-fast-prefilter
                  the same two in the quality "fast"
+oidn-balanced-prefilter
+                 oidn-prefilter with the smaller network of the quality "balanced"
+oidn-albedo      oidn with the albedo denoised first
 oidn-color       the first without albedo and normal
 oidn-reference   the denoised *references*: about the best possible score
 nlm              non-local means of scikit-image on log(1 + 16 x), without features; its strength is
@@ -28,7 +31,7 @@ import numpy as np
 from dataset import add_layout_flags, albedo, normal, pixels, reference, scenes, write
 from demc.torch.exr import Frame, as_kind, read_exr
 from demc.torch.layouts import BUFFERS
-from oidn import with_prefilter
+from oidn import prefiltered, with_prefilter
 
 LOG_SCALE = 16
 """Factor of the radiance before log(1 + x); dark and bright noise then have similar size."""
@@ -42,6 +45,12 @@ def oidn(frame: Frame, quality: str = "high") -> np.ndarray:
 
 def oidn_prefilter(frame: Frame, quality: str = "high") -> np.ndarray:
     return with_prefilter(pixels(frame.color), albedo(frame), normal(frame), quality)
+
+
+def oidn_albedo(frame: Frame) -> np.ndarray:
+    import pyoidn
+
+    return pyoidn.denoise(pixels(frame.color), albedo=prefiltered("albedo", albedo(frame)), normal=normal(frame), hdr=True)
 
 
 def oidn_color(frame: Frame) -> np.ndarray:
@@ -72,6 +81,8 @@ DENOISERS: dict[str, Callable[[Frame], np.ndarray]] = {
     "oidn-prefilter": oidn_prefilter,
     "oidn-fast": partial(oidn, quality="fast"),
     "oidn-fast-prefilter": partial(oidn_prefilter, quality="fast"),
+    "oidn-balanced-prefilter": partial(oidn_prefilter, quality="balanced"),
+    "oidn-albedo": oidn_albedo,
     "oidn-color": oidn_color,
     "oidn-reference": oidn_reference,
     "nlm": nlm,

@@ -17,7 +17,7 @@ def with_prefilter(color: np.ndarray, albedo: np.ndarray, normal: np.ndarray, qu
 
 
 def prefiltered(kind: str, feature: np.ndarray, quality: str = "high") -> np.ndarray:
-    """One feature, `albedo` or `normal`, denoised without guides; `quality` is `high` or `fast`."""
+    """One feature, `albedo` or `normal`, denoised without guides; `quality` is `high`, `balanced`, or `fast`."""
     out = np.empty_like(feature)
     with feature_filter(kind, feature, out, quality) as filter:
         filter.execute()
