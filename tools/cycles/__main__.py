@@ -37,7 +37,7 @@ SHARES = {"things": 0.25, "volume": 0.35, "fur": 0.25, "motion": 0.15}
 NOISE = (0.003, 16.0)
 """Range of RelMSE of an image with 4 samples per pixel. Views outside it are left out."""
 PRESETS = {
-    "train": {"scenes": 160, "size": 192, "spp": rendered.COUNTS, "counts": 3, "seed": 5929},
+    "train": {"scenes": 160, "size": 192, "spp": rendered.COUNTS, "counts": 3, "relit": 0.7, "seed": 5929},
     "heldout-2": rendered.HELD_OUT | {"scenes": 36, "seed": 6929},
 }
 """Options of `--preset`."""
@@ -58,18 +58,23 @@ def main() -> None:
         if name not in own or name in known or all((folder / f"{file}.exr").exists() for file in files.values()):
             continue
         place = {"base": f"cycles-{args.seed}-{index}", "kind": kinds[index]}
-        photograph = partial(photograph_view, args, index, view, kinds[index], counts, shot.Settings.draw(rng, args.adaptive))
+        settings = shot.Settings.draw(rng, args.adaptive)
+        photograph = partial(photograph_view, args, index, view, kinds[index], counts, settings, rng)
         rendered.make_view(args, name, place, files.values(), RENDERER, photograph)
     rendered.write_manifest(args, RENDERER)
 
 
-def photograph_view(args, index: int, view: int, kind: str, counts: list[int], settings: shot.Settings) -> list[tuple[dict, dict]]:
+def photograph_view(
+    args: argparse.Namespace, index: int, view: int, kind: str, counts: list[int], settings: shot.Settings, rng: np.random.Generator
+) -> list[tuple[dict, dict]]:
     """Builds a scene and renders one view of it."""
     stage = scenes.build(args.seed, index, kind, args.edition)
     stage.camera(np.random.default_rng([args.seed, index, view, 3]))
     shot.prepare(stage.scene, args.size, settings)
+    stage.group(rng)
+    mixes = shot.draw_mixes(rng, len(counts), args.relit)
     seed = (args.seed * 100003 + index * 16 + view) * 1000
-    return shot.photograph(stage.scene, seed, counts, settings, args.ref_spp, args.residual, NOISE)
+    return shot.photograph(stage.scene, seed, counts, settings, mixes, args.ref_spp, args.residual, NOISE)
 
 
 def in_turn(count: int) -> list[str]:
@@ -88,6 +93,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--size", type=int, default=224, metavar="PIXELS", help="height and width [224]")
     parser.add_argument("--kind", choices=[*scenes.KINDS], help="things alone, in fog, smoke, or clouds, with hair, or moving [all in turn]")
     parser.add_argument("--adaptive", type=float, default=0.3, metavar="SHARE", help="share of the views with adaptive sampling [0.3]")
+    parser.add_argument("--relit", type=float, default=0.0, metavar="SHARE", help="share of the views whose images each have other light: sky and groups of lamps are rendered apart and mixed anew [0]")
     parser.add_argument("--edition", choices=[*scenes.EDITIONS], default="train", help="shapes, textures, and lights of training or of the held-out set; they share none [train]")
     rendered.add_flags(parser)
     parser.add_argument("--preset", choices=[*PRESETS], help="training data or test scenes of the bundled models; other options change it")

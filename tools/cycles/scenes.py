@@ -250,6 +250,13 @@ class Stage:
             bpy.ops.mesh.primitive_cylinder_add(radius=radius, depth=long, location=self.above(), rotation=rng.uniform(0, 3.14, 3))
             bpy.context.object.data.materials.append(self.painter.lamp(logarithmic(rng, 0.5, 3) / (radius * long)))
 
+    def group(self, rng: Rng) -> None:
+        """Puts the sky in the first of Cycles' light groups, each lamp in one of the others."""
+        sky, *lamps = (group.name for group in self.scene.view_layers[0].lightgroups)
+        self.scene.world.lightgroup = sky
+        for thing in self.scene.objects:
+            thing.lightgroup = str(rng.choice(lamps))
+
     # Kinds.
 
     def things_alone(self) -> None:

@@ -28,15 +28,15 @@ class Cycles(unittest.TestCase):
         import numpy as np
         import OpenEXR
 
-        for edition in ("train", "heldout"):
+        for edition, relit in (("train", 1), ("heldout", 0)):
             for kind in ("things", "volume", "fur", "motion"):
                 with self.subTest(kind, edition=edition), tempfile.TemporaryDirectory() as folder:
-                    ended = run("-o", folder, "--scenes", 2, *SMALL, "--kind", kind, "--edition", edition, "--spp", "1,8")
+                    ended = run("-o", folder, "--scenes", 2, *SMALL, "--kind", kind, "--edition", edition, "--relit", relit, "--spp", "1,8")
                     self.assertEqual(ended.returncode, 0, ended.stderr)
                     listed = manifest(folder)
                     self.assertEqual(len(listed["scenes"]) / 2 + len(listed["left_out"]), 2)
                     self.assertTrue(listed["scenes"], ended.stdout)
-                    errors = {1: 0.0, 8: 0.0}
+                    errors, references = {1: 0.0, 8: 0.0}, {}
                     for scene in listed["scenes"]:
                         self.assertEqual((scene["kind"], scene["width"]), (kind, 48))
                         with OpenEXR.File(str(Path(folder, scene["file"])), separate_channels=True) as file:
@@ -46,7 +46,10 @@ class Cycles(unittest.TestCase):
                         self.assertAlmostEqual(np.sort(luminance.ravel())[: int(0.98 * luminance.size)].mean(), 0.22, delta=0.08)
                         # Without bright dots, which few samples rarely find.
                         errors[scene["spp"]] += np.minimum(abs(planes["G"] - planes["ref.G"]), 0.2).mean()
+                        references.setdefault(scene["base"], []).append(np.stack([planes[f"ref.{name}"] for name in "RGB"]))
                     self.assertLess(errors[8], errors[1])
+                    for one, other in references.values():
+                        self.assertEqual(abs(one - other).max() > 0.01, bool(relit))
 
     def test_motion_blurs_what_moves(self) -> None:
         code = """
