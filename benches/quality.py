@@ -1,13 +1,17 @@
 #!/usr/bin/env python3
 """Compares models with Open Image Denoise (OIDN): the table of the model card.
 
-    pip install numpy OpenEXR pyoidn
+    pip install numpy OpenEXR pillow pyoidn
     python3 benches/quality.py --data public=data/renders --data held-out=data/heldout
 
 Each row is one program on the test scenes of one data set with one number of samples per pixel; with 4, also
 on those of each kind and of each renderer. A ratio or difference compares with the better of OIDN (quality
 high) with albedo and normal, plain and denoised first, per column. Intervals are 95 % bootstrap intervals
 over scenes. The images of OIDN and the scores are kept in --work.
+
+--pictures also shows the hardest views: the noisy image, the first model, OIDN plain and with both denoised first,
+the reference. `hardest-4spp.jpg` has the four with the largest RelMSE of the model, `kinds.jpg` one of each
+kind of scene and of each renderer.
 """
 import argparse
 import json
@@ -33,6 +37,10 @@ COLUMNS = {
 USUAL = 4
 """Samples per pixel of the tables per kind of scene and per renderer."""
 METRICS = ("relmse", "ssim", "flip", "energy-bias")
+HARDEST = 4
+"""Views of a picture."""
+SHOWN = 0.25
+"""Mean of a reference in a picture."""
 
 
 def pair(text: str) -> tuple[str, pathlib.Path]:
@@ -104,18 +112,61 @@ def table(scores: dict, scenes: list[str]) -> list[list[str]]:
     return rows
 
 
+def pixels(path: pathlib.Path, prefix: str = "") -> np.ndarray:
+    """An image in linear HDR, `[height, width, 3]`."""
+    import OpenEXR
+
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return np.stack([file.channels()[prefix + name].pixels.astype(np.float32) for name in "RGB"], -1)
+
+
+def view(data: pathlib.Path, scene: str, model: pathlib.Path, work: pathlib.Path, program: str) -> np.ndarray:
+    """A row of a picture, 8 bits in gamma space: noisy, the model, OIDN's ways, reference."""
+    entry = next(entry for entry in json.loads((data / "manifest.json").read_text())["scenes"] if entry["name"] == scene)
+    source, own = data / entry["file"], work / "denoised.exr"
+    run(program, "denoise", "--model", model, source, "-o", own, "--overwrite")
+    reference = pixels(source, "ref.")
+    images = [pixels(source), pixels(own), *(pixels(work / peer / f"{source.stem}.exr") for peer in BEST_OF), reference]
+    row = np.concatenate(images, axis=1) * SHOWN / reference.mean()
+    return (255 * row.clip(0, 1) ** (1 / 2.2)).round().astype(np.uint8)
+
+
+def draw(scores: dict, data: pathlib.Path, model: tuple[str, pathlib.Path], work: pathlib.Path, program: str, folder: pathlib.Path) -> None:
+    """The pictures of a data set."""
+    from PIL import Image
+
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures: dict[str, list[str]] = {}
+    for group, scenes in groups(data).items():
+        part, _, count = group.rpartition(", ")
+        hardest = sorted(scenes, key=lambda scene: -scores[scene][model[0]]["relmse"])
+        if part:
+            pictures.setdefault("kinds", []).append(hardest[0])
+        else:
+            pictures["hardest-" + count.replace(" ", "")] = hardest[:HARDEST]
+    for name, scenes in pictures.items():
+        # The hardest view of a kind is often that of its renderer, too.
+        rows = [view(data, scene, model[1], work, program) for scene in dict.fromkeys(scenes)]
+        width = max(row.shape[1] for row in rows)
+        rows = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows]
+        Image.fromarray(np.concatenate(rows)).save(folder / f"{name}.jpg", quality=90)
+        print(f"{folder / name}.jpg: {', '.join(dict.fromkeys(scenes))}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", action="append", type=pair, required=True, metavar="NAME=DIR", help="data set with test scenes; can be repeated")
     parser.add_argument("--model", action="append", type=pair, metavar="NAME=FILE", help="exported weights; can be repeated [both bundled models]")
     parser.add_argument("--work", type=pathlib.Path, default=ROOT / "runs/compared", metavar="DIR", help="OIDN's images and the scores [runs/compared]")
     parser.add_argument("--program", default=str(ROOT / "target/release/demc-infer"), metavar="FILE", help="demc-infer [target/release/demc-infer]")
+    parser.add_argument("--pictures", type=pathlib.Path, metavar="DIR", help="folder for pictures of the hardest views of each data set")
     args = parser.parse_args()
+    models = args.model or BUNDLED
     for data_name, data in args.data:
         scores: dict[str, dict] = {}
         work = args.work / data_name
         work.mkdir(parents=True, exist_ok=True)
-        for model in args.model or BUNDLED:
+        for model in models:
             for scene, programs in scores_of(data, model, work, args.program).items():
                 scores.setdefault(scene, {}).update(programs)
         for group, scenes in groups(data).items():
@@ -123,6 +174,11 @@ def main() -> None:
             print("| program | " + " | ".join(COLUMNS) + " |\n|---|" + "---:|" * len(COLUMNS))
             for row in table(scores, scenes):
                 print("| " + " | ".join(row) + " |")
+        for name, _ in models:
+            worse = [scene for scene, programs in scores.items() if programs[name]["relmse"] > programs["noisy"]["relmse"]]
+            print(f"\n{name}: larger RelMSE than the noisy image in {len(worse)} of {len(scores)} images {' '.join(worse)}")
+        if args.pictures:
+            draw(scores, data, models[0], work, args.program, args.pictures / data_name)
 
 
 if __name__ == "__main__":
