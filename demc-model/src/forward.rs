@@ -76,9 +76,7 @@ impl Denoiser {
                 Ok(network.forward([color, features], layers, self.ops()))
             }
             Body::Kpcn(networks) => Ok((networks.forward(color, features, self.ops()), None)),
-            Body::Unet(network)
-                if network.side.is_none() && self.infers_on(&network.device(), &color.device()) =>
-            {
+            Body::Unet(network) if self.infers_on(&network.device(), &color.device()) => {
                 inference::forward_unet(network, [color, features], layers, observer)
             }
             Body::Unet(network) => Ok(network.forward([color, features], layers, self.ops())),

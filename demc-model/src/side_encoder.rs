@@ -18,7 +18,7 @@ use crate::unet_size::UNET_LEVELS;
 use crate::weights::{Builder, Stage, WeightsError};
 
 /// Channels of each level as multiples of the width, from the full resolution down.
-const LEVEL_WIDTHS: [usize; UNET_LEVELS] = [1, 2, 4, 4];
+pub(crate) const LEVEL_WIDTHS: [usize; UNET_LEVELS] = [1, 2, 4, 4];
 
 /// The encoder and its fusions.
 #[derive(Module, Debug)]

@@ -166,8 +166,8 @@ impl ConvChain<'_> {
     }
 
     /// Computes all rows that the input allows. `observe` receives each convolution's index, the
-    /// rows that it has computed, and their values.
-    pub(super) fn advance(&mut self, mut observe: impl FnMut(usize, Range<usize>, &[f32])) {
+    /// rows that it has computed, and their values, which it may change.
+    pub(super) fn advance(&mut self, mut observe: impl FnMut(usize, Range<usize>, &mut [f32])) {
         for index in 0..self.convs.len() {
             let (convs, next) = self.convs.split_at_mut(index + 1);
             let next = next
@@ -176,7 +176,7 @@ impl ConvChain<'_> {
             let rows = convs[index].pending();
             if !rows.is_empty() {
                 convs[index].compute(&rows, next.push(rows.len()));
-                observe(index, rows.clone(), next.last(rows.len()));
+                observe(index, rows.clone(), next.last_mut(rows.len()));
             }
         }
     }

@@ -36,7 +36,7 @@ pub fn pass_bytes(
 ) -> u64 {
     match config.variant {
         Variant::Kpcn => return kpcn_bytes(config, height * width),
-        Variant::Unet if ops.has_fast_inference() => {
+        variant if variant.is_unet() && ops.has_fast_inference() => {
             return unet_bytes(config, height, width, layers);
         }
         variant if variant.is_unet() => {

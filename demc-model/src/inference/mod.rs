@@ -25,6 +25,7 @@ mod images;
 mod kernel_head;
 mod mixed_head;
 mod pass;
+mod side_encoder;
 #[cfg(test)]
 mod tests;
 mod unet;
@@ -83,7 +84,7 @@ fn forward_with(
         tile,
         plan,
         model,
-        watch: &Watch::new(grid, observer),
+        watch: &Watch::new(grid, 2, observer),
     };
     let color = model.decoder.head.is_none().then(|| images.color());
     let encoded = pass.encode(images)?;

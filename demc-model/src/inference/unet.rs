@@ -19,8 +19,9 @@ use super::images::host;
 use super::images_of;
 use super::mixed_head::MixedPass;
 use super::pass::BandPlan;
+use super::side_encoder::SideMaps;
 use super::watch::{Cancelled, Observer, Watch};
-use crate::config::{COLOR_CHANNELS, FEATURE_CHANNELS};
+use crate::config::COLOR_CHANNELS;
 use crate::layers::ConvStack;
 use crate::unet::{UNET_LEVELS, Unet};
 
@@ -33,76 +34,116 @@ pub(crate) fn forward(
 ) -> Result<(Tensor<4>, Option<Tensor<4>>), Cancelled> {
     let [_, _, height, width] = color.dims();
     let input = Input::new(network, color, features);
+    let decoder_and_encoders = 2 + usize::from(network.side.is_some());
     let pass = UnetPass {
         plan: BandPlan::new(width),
         tile: Tile::F4,
-        watch: &Watch::new(input.grid, observer),
+        watch: &Watch::new(input.color.grid, decoder_and_encoders, observer),
     };
     let (out, layers) = pass.forward(network, &input, layers)?;
     let layers = layers.map(|layers| images_of(layers, height, width));
     Ok((images_of(out, height, width), layers))
 }
 
-/// The planes of colour and guides.
+/// Planar images of some channels.
+pub(super) struct ImagePlanes {
+    pub(super) grid: Grid,
+    channels: usize,
+    planes: FlexTensor,
+}
+
+impl ImagePlanes {
+    fn new(images: Tensor<4>) -> Self {
+        let [batch, channels, height, width] = images.dims();
+        ImagePlanes {
+            grid: Grid {
+                batch,
+                height,
+                width,
+            },
+            channels,
+            planes: host(images),
+        }
+    }
+
+    /// The planes of some channels of an image.
+    fn planes(&self, image: usize, channels: Range<usize>) -> impl Iterator<Item = &[f32]> {
+        let all = self.planes.storage::<f32>();
+        let planes = all.chunks_exact(self.grid.height * self.grid.width);
+        planes
+            .skip(image * self.channels + channels.start)
+            .take(channels.len())
+    }
+
+    /// Rows of some channels of an image, channels last.
+    pub(super) fn interleave(
+        &self,
+        image: usize,
+        rows: Range<usize>,
+        channels: Range<usize>,
+        target: &mut [f32],
+    ) {
+        let planes: Vec<&[f32]> = self.planes(image, channels).collect();
+        interleave(&planes, self.grid.width, rows, target);
+    }
+}
+
+/// Rows of planes of a width, channels last.
+fn interleave(planes: &[&[f32]], width: usize, rows: Range<usize>, target: &mut [f32]) {
+    let lines = target.par_chunks_mut(width * planes.len()).enumerate();
+    lines.for_each(|(line, target)| {
+        let line = (rows.start + line) * width;
+        for (channel, plane) in planes.iter().enumerate() {
+            let pixels = target.chunks_exact_mut(planes.len());
+            for (pixel, value) in pixels.zip(&plane[line..line + width]) {
+                pixel[channel] = *value;
+            }
+        }
+    });
+}
+
+/// Colour and features.
 struct Input {
-    grid: Grid,
-    color: FlexTensor,
-    features: Option<FlexTensor>,
+    color: ImagePlanes,
+    features: Option<ImagePlanes>,
     /// The first feature channel of each guide.
     guides: &'static [usize],
 }
 
 impl Input {
     fn new(network: &Unet, color: Tensor<4>, features: Tensor<4>) -> Self {
-        let [batch, _, height, width] = color.dims();
         let guides = network.guides().first_channels();
+        let takes_features = !guides.is_empty() || network.side.is_some();
         Input {
-            grid: Grid {
-                batch,
-                height,
-                width,
-            },
-            color: host(color),
-            features: (!guides.is_empty()).then(|| host(features)),
+            color: ImagePlanes::new(color),
+            features: takes_features.then(|| ImagePlanes::new(features)),
             guides,
         }
     }
 
+    /// Channels of colour and guides.
     fn channels(&self) -> usize {
         COLOR_CHANNELS * (1 + self.guides.len())
     }
 
-    /// Rows of an image, channels last.
+    fn features(&self) -> &ImagePlanes {
+        self.features.as_ref().expect("the network takes features")
+    }
+
+    /// Rows of colour and guides of an image, channels last.
     fn interleave(&self, image: usize, rows: Range<usize>, target: &mut [f32]) {
-        let Grid { height, width, .. } = self.grid;
-        let pixels = height * width;
-        let colors = self.color.storage::<f32>().chunks_exact(pixels);
-        let mut planes: Vec<&[f32]> = colors
-            .skip(image * COLOR_CHANNELS)
-            .take(COLOR_CHANNELS)
-            .collect();
+        let mut planes: Vec<&[f32]> = self.color.planes(image, 0..COLOR_CHANNELS).collect();
         for first in self.guides {
-            let features = self.features.as_ref().expect("guides are features");
-            let all = features.storage::<f32>().chunks_exact(pixels);
             planes.extend(
-                all.skip(image * FEATURE_CHANNELS + first)
-                    .take(COLOR_CHANNELS),
+                self.features()
+                    .planes(image, *first..first + COLOR_CHANNELS),
             );
         }
-        let lines = target.par_chunks_mut(width * planes.len()).enumerate();
-        lines.for_each(|(line, target)| {
-            let line = (rows.start + line) * width;
-            for (channel, plane) in planes.iter().enumerate() {
-                let pixels = target.chunks_exact_mut(planes.len());
-                for (pixel, value) in pixels.zip(&plane[line..line + width]) {
-                    pixel[channel] = *value;
-                }
-            }
-        });
+        interleave(&planes, self.color.grid.width, rows, target);
     }
 }
 
-struct UnetPass<'a> {
+pub(super) struct UnetPass<'a> {
     plan: BandPlan,
     tile: Tile,
     watch: &'a Watch<'a, 'a>,
@@ -116,12 +157,16 @@ impl UnetPass<'_> {
         input: &Input,
         layers: Option<Tensor<4>>,
     ) -> Result<(Vec<f32>, Option<Vec<f32>>), Cancelled> {
-        let grid = input.grid;
+        let grid = input.color.grid;
+        let side = network.side.as_ref();
+        let mut side = side
+            .map(|encoder| SideMaps::new(self, encoder, input.features()))
+            .transpose()?;
         // The input of each encoder level but the first, which is the skip of the decoder's.
         let mut skips: Vec<FeatureMaps> = Vec::with_capacity(UNET_LEVELS);
         let mixed = network.mixed.as_ref();
-        let mut mixed =
-            mixed.map(|head| MixedPass::new(Isa::current(), head, grid, &input.color, layers));
+        let mut mixed = mixed
+            .map(|head| MixedPass::new(Isa::current(), head, grid, &input.color.planes, layers));
         for (level, module) in network.encoder.iter().enumerate() {
             let grid = (0..level).fold(grid, |grid, _| grid.halved());
             let convs = folded(module);
@@ -156,24 +201,31 @@ impl UnetPass<'_> {
             |image, rows, target| {
                 target.copy_from_slice(deepest.rows(image, rows));
             },
+            |_, _, _| (),
         )?;
         drop(deepest);
         let (last, upper) = network.decoder.split_last().expect("four levels");
         for (index, module) in upper.iter().enumerate() {
             let skip = skips.pop().expect("a skip for each level but the last");
-            let below = x;
-            x = self.level(&folded(module), skip.grid, |image, rows, target| {
-                append(
-                    &below,
-                    image,
-                    rows.clone(),
-                    skip.grid,
-                    skip.rows(image, rows),
-                    target,
-                );
-            })?;
+            let (level, below) = (UNET_LEVELS - 1 - index, x);
+            x = self.level(
+                &folded(module),
+                skip.grid,
+                |image, rows, target| {
+                    let appended = skip.rows(image, rows.clone());
+                    append(&below, image, rows, skip.grid, appended, target);
+                },
+                |image, rows, values| {
+                    if let Some(side) = &side {
+                        side.fuse(level, image, rows, values);
+                    }
+                },
+            )?;
+            if let Some(side) = &mut side {
+                side.free(level);
+            }
             if let Some(mixed) = &mut mixed {
-                mixed.filter_level(UNET_LEVELS - 1 - index, &x, self.plan.band);
+                mixed.filter_level(level, &x, self.plan.band);
             }
         }
         let mut convs = folded(last);
@@ -193,10 +245,13 @@ impl UnetPass<'_> {
                 if conv == head {
                     let planar = &mut planar[image * image_values..][..image_values];
                     write_rows(planar, grid, rows, values);
-                } else if conv + 1 == head
-                    && let Some(mixed) = &mut mixed
-                {
-                    mixed.filter_rows(image, rows, values);
+                } else if conv + 1 == head {
+                    if let Some(side) = &side {
+                        side.fuse(0, image, rows.clone(), values);
+                    }
+                    if let Some(mixed) = &mut mixed {
+                        mixed.filter_rows(image, rows, values);
+                    }
                 }
             },
         )?;
@@ -204,17 +259,19 @@ impl UnetPass<'_> {
         Ok((planar, layers))
     }
 
-    /// A level's whole output.
+    /// A level's whole output, whose rows `complete` may change.
     fn level(
         &self,
         convs: &[FoldedConv],
         grid: Grid,
         fill: impl FnMut(usize, Range<usize>, &mut [f32]),
+        complete: impl Fn(usize, Range<usize>, &mut [f32]),
     ) -> Result<FeatureMaps, Cancelled> {
         let outputs = convs.last().expect("a convolution").outputs();
         let mut maps = FeatureMaps::new(grid, outputs);
         self.run(convs, grid, fill, |conv, image, rows, values| {
             if conv + 1 == convs.len() {
+                complete(image, rows.clone(), values);
                 maps.rows_mut(image, rows).copy_from_slice(values);
             }
         })?;
@@ -222,13 +279,13 @@ impl UnetPass<'_> {
     }
 
     /// Runs convolutions with ReLU on bands of maps on `grid`: `fill` writes rows of an image's input,
-    /// `take` gets the index of a convolution, and rows of its output for an image.
-    fn run(
+    /// `take` gets the index of a convolution, and rows of its output for an image, which it may change.
+    pub(super) fn run(
         &self,
         convs: &[FoldedConv],
         grid: Grid,
         mut fill: impl FnMut(usize, Range<usize>, &mut [f32]),
-        mut take: impl FnMut(usize, usize, Range<usize>, &[f32]),
+        mut take: impl FnMut(usize, usize, Range<usize>, &mut [f32]),
     ) -> Result<(), Cancelled> {
         let banded = convs.iter().map(|conv| {
             let prepared = PreparedConvolution::new(Isa::current(), self.tile, conv.rectified());
@@ -276,7 +333,7 @@ fn append(
     double::forward(band, coarse, skip, target);
 }
 
-fn folded(level: &ConvStack) -> Vec<FoldedConv> {
+pub(super) fn folded(level: &ConvStack) -> Vec<FoldedConv> {
     let convs = level.convs.iter();
     convs.map(|conv| FoldedConv::conv(conv, None)).collect()
 }

@@ -23,15 +23,15 @@ pub(super) struct Watch<'a, 'b> {
 }
 
 impl<'a, 'b> Watch<'a, 'b> {
-    /// Watches a pass over images on `grid`.
-    pub(super) fn new(grid: Grid, observer: &'a mut Observer<'b>) -> Self {
+    /// Watches a pass over images on `grid` that computes every level `times` times, once in each encoder
+    /// and in the decoder.
+    pub(super) fn new(grid: Grid, times: usize, observer: &'a mut Observer<'b>) -> Self {
         let levels =
             (0..LEVELS).map(|level| grid.pixels() as f64 / f64::from(4u32.pow(level as u32)));
         Watch {
             observer: RefCell::new(observer),
             done: Cell::new(0.0),
-            // Encoders and decoder compute every level once.
-            all: 2.0 * levels.sum::<f64>(),
+            all: times as f64 * levels.sum::<f64>(),
         }
     }
 
