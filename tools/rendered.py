@@ -191,6 +191,18 @@ def write_manifest(args: argparse.Namespace, renderer: str) -> None:
     write_json(args.output / "manifest.json", manifest)
 
 
+def run(main: Callable[[], None]) -> None:
+    """Runs a program: a file that cannot be read or written ends it with one line."""
+    try:
+        main()
+    except BrokenPipeError:
+        # The reader of the progress has seen enough. Files are whole, and the next run resumes.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except OSError as error:
+        sys.exit(f"error: {error}")
+
+
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """The options of every renderer."""
     parser.add_argument("--spp", type=numbers, default=[4], metavar="N,...", help="samples per pixel of the noisy images [4]")

@@ -36,7 +36,7 @@ from stills import Still
 from variant import mi
 
 from demc.torch.shard import add_shard_flag  # `views` puts the packages on the path.
-from rendered import COUNTS, HELD_OUT, TEST, add_flags, drawn_counts, files_of, left_out, make_view, write_manifest
+from rendered import COUNTS, HELD_OUT, TEST, add_flags, drawn_counts, files_of, left_out, make_view, run, write_manifest
 
 RENDERER = f"Mitsuba {mi.__version__}"
 NOISE = (0.2, 16.0)
@@ -221,4 +221,4 @@ def check(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -94,6 +94,12 @@ print(np.abs(moving - still).mean(), np.abs(again - still).mean())
                 # Half floats round sums of another order to a neighbour.
                 self.assertGreater(np.isclose(one, other, rtol=2e-3, atol=1e-3).mean(), 0.98)
 
+    def test_a_folder_that_cannot_be_made_is_one_line(self) -> None:
+        with tempfile.NamedTemporaryFile() as file:
+            ended = run("-o", f"{file.name}/data", "--scenes", 1)
+        self.assertEqual((ended.returncode, ended.stderr.count("\n")), (1, 1), ended.stderr)
+        self.assertIn("error: ", ended.stderr)
+
 
 if __name__ == "__main__":
     unittest.main()

@@ -48,6 +48,12 @@ class Render(unittest.TestCase):
         ball = {"type": "sphere", "center": [0.4, -0.5, 0.5], "radius": 0.3, "bsdf": {"type": "roughconductor", "material": "Cu"}}
         return scene | {"ball": ball}
 
+    def test_a_folder_that_cannot_be_made_is_one_line(self) -> None:
+        with tempfile.NamedTemporaryFile() as file:
+            ended = run("-o", f"{file.name}/data", "--stills", 1)
+        self.assertEqual((ended.returncode, ended.stderr.count("\n")), (1, 1), ended.stderr)
+        self.assertIn("error: ", ended.stderr)
+
     def test_radiance_is_that_of_mitsubas_path_integrator(self) -> None:
         import numpy as np
         import tracer
