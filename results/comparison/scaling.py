@@ -1,9 +1,12 @@
 """Draws how the differences change with training steps and with the width.
 
     pip install matplotlib
+    for size in quarter half paper narrow; do
+        demc-train ablate --results results/comparison/$size/results.csv
+    done
     python results/comparison/scaling.py -o results/comparison/scaling.svg
 
-It reads the `ablation.json` of each folder, which `demc-train ablate --results FOLDER/results.csv` writes.
+It reads the `ablation.json` that `ablate` writes beside each file.
 """
 
 import argparse
@@ -48,7 +51,7 @@ def main() -> None:
         panel.set_xticks(range(len(folders)), [f"{value:,}" for value in folders])
         panel.set_xlabel(label)
     panels[0].set_ylabel("change of RelMSE, %")
-    panels[0].legend(frameon=False)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(VARIANTS), frameon=False)
     figure.savefig(args.output, metadata={"Date": None})
 
 
