@@ -30,6 +30,7 @@ mod side_encoder;
 mod tests;
 mod unet;
 mod unet_estimate;
+mod unet_pass;
 mod watch;
 
 use burn::backend::Flex;

@@ -9,7 +9,7 @@ use demc_kernels::{Isa, memory, pool};
 use super::encoder::folded_block;
 use super::feature_maps::FeatureMaps;
 use super::folded::FoldedConv;
-use super::unet::{ImagePlanes, UnetPass, folded};
+use super::unet_pass::{ImagePlanes, UnetPass, folded};
 use super::watch::Cancelled;
 use crate::config::FEATURE_CHANNELS;
 use crate::side_encoder::SideEncoder;
