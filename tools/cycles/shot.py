@@ -77,19 +77,24 @@ def prepare(scene: bpy.types.Scene, size: int, settings: Settings) -> None:
         layer.lightgroups.add(name=group)
 
 
-def trace(scene: bpy.types.Scene, samples: int, seed: int, threshold: float = 0.0) -> dict[str, np.ndarray]:
-    """Renders `samples` per pixel and returns `FEATURES`, `[H, W, 3]` float64 each, and the `light` of each group, `[3, H, W, 3]`."""
-    cycles = scene.cycles
-    cycles.samples, cycles.seed = samples, seed % (1 << 31)
-    cycles.use_adaptive_sampling = threshold > 0
-    cycles.adaptive_threshold, cycles.adaptive_min_samples = threshold, max(1, samples // 8)
+def passes(scene: bpy.types.Scene) -> dict[str, np.ndarray]:
+    """All channels of a rendered image, `[H, W]` each, by Blender's names."""
     with tempfile.TemporaryDirectory() as folder:
         path = os.path.join(folder, "view.exr")
         scene.render.filepath = path
         with quiet():
             bpy.ops.render.render(write_still=True)
         with OpenEXR.File(path, separate_channels=True) as file:
-            planes = {name: channel.pixels for part in range(len(file.parts)) for name, channel in file.channels(part).items()}
+            return {name: channel.pixels for part in range(len(file.parts)) for name, channel in file.channels(part).items()}
+
+
+def trace(scene: bpy.types.Scene, samples: int, seed: int, threshold: float = 0.0) -> dict[str, np.ndarray]:
+    """Renders `samples` per pixel and returns `FEATURES`, `[H, W, 3]` float64 each, and the `light` of each group, `[3, H, W, 3]`."""
+    cycles = scene.cycles
+    cycles.samples, cycles.seed = samples, seed % (1 << 31)
+    cycles.use_adaptive_sampling = threshold > 0
+    cycles.adaptive_threshold, cycles.adaptive_min_samples = threshold, max(1, samples // 8)
+    planes = passes(scene)
 
     def image(name: str) -> np.ndarray:
         start, _, ends = name.rpartition(".")

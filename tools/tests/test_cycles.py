@@ -69,6 +69,29 @@ print(np.abs(moving - still).mean(), np.abs(again - still).mean())
         blur, noise = map(float, ended.stdout.split())
         self.assertGreater(blur, 2 * noise)
 
+    def test_the_groups_of_lights_add_up_to_the_image(self) -> None:
+        code = """
+import sys
+sys.path[:0] = sys.argv[1:3]
+import numpy as np, scenes, shot
+for index in range(3):
+    stage = scenes.build(6929, index, "things", "heldout")
+    stage.camera(np.random.default_rng(0))
+    shot.prepare(stage.scene, 32, shot.Settings("BOX", 0.0))
+    stage.group(np.random.default_rng(1))
+    stage.scene.cycles.samples = 4
+    planes = shot.passes(stage.scene)
+    groups = sum(planes[f"ViewLayer.Combined_{group}.G"] for group in shot.GROUPS)
+    print(np.abs(groups - planes["ViewLayer.Combined.G"]).max(), groups.mean())
+"""
+        ended = subprocess.run([sys.executable, "-c", code, FOLDER, FOLDER.parent], capture_output=True, text=True)
+        self.assertEqual(ended.returncode, 0, ended.stderr)
+        self.assertEqual(len(ended.stdout.splitlines()), 3)
+        for line in ended.stdout.splitlines():
+            difference, mean = map(float, line.split())
+            self.assertLess(difference, 1e-5)
+            self.assertGreater(mean, 0.01)
+
     def test_shards_make_the_data_set_of_one_run_and_resume(self) -> None:
         import numpy as np
         import OpenEXR

@@ -65,8 +65,8 @@ fn checksums<'a>(
 pub struct DataContents {
     /// The SHA-256 of each scene's file, by the scene's name.
     pub checksums: BTreeMap<String, String>,
-    /// What a run's numbers depend on: a line for each scene in the manifest's order, with its own channel
-    /// layout if it has one, and the data set's layout if that is not the default.
+    /// What a run's numbers depend on. There is a line for each scene in the manifest's order, with its own
+    /// channel layout if it has one. The data set's layout follows if it is not the default.
     pub text: String,
 }
 
