@@ -30,6 +30,16 @@ const ADAM: Tolerance = Tolerance {
 /// some whose gradients are as small as rounding errors, and Adam divides by the gradient.
 const PATH_OF_UNET: f32 = 1e-3;
 
+/// Looser than [`PATH_OF_UNET`], which `flex` meets. Measured: 3.6e-3 (`wgpu` on llvmpipe, AVX-512).
+const PATH_OF_UNET_ON_OTHER_DEVICES: f32 = 1e-2;
+
+/// Looser than [`GRADIENT`], which `flex` meets. Measured: 5.6e-5 of the largest value (`wgpu` on
+/// llvmpipe, AVX-512).
+const GRADIENT_OF_UNET_ON_OTHER_DEVICES: Tolerance = Tolerance {
+    of_largest: 2e-4,
+    ..GRADIENT
+};
+
 /// Looser than [`ADAM`], which `flex` meets. Measured: 1.5e-4 (`wgpu` on llvmpipe, AVX-512).
 const ADAM_ON_OTHER_DEVICES: Tolerance = Tolerance {
     absolute: 3e-4,
@@ -156,9 +166,17 @@ fn the_unet_is_pytorchs() {
     let device = super::device().autodiff();
     let batch = FixtureBatch::read(&device);
     let started = values_by_name(fixture.group("weight/"));
+    let (gradient, largest_share) = if has_kernels(&device) {
+        (GRADIENT, PATH_OF_UNET)
+    } else {
+        (
+            GRADIENT_OF_UNET_ON_OTHER_DEVICES,
+            PATH_OF_UNET_ON_OTHER_DEVICES,
+        )
+    };
     for ops in Ops::ALL {
         let model = network(&config, &fixture, &device).with_ops(ops);
-        check_first_step(&model, &batch, config.reading, &fixture);
+        check_first_step(&model, &batch, config.reading, &fixture, gradient);
         let stepped = step_with_adam(model, &batch);
         let expected = fixture.group("adam/");
         assert_eq!(stepped.len(), expected.len(), "number of weights");
@@ -171,7 +189,7 @@ fn the_unet_is_pytorchs() {
                 path += (expected - start).powi(2);
             }
             let share = (error / path).sqrt();
-            assert!(share < PATH_OF_UNET, "{ops:?}, {}: {share}", expected.name);
+            assert!(share < largest_share, "{ops:?}, {}: {share}", expected.name);
         }
     }
 }
@@ -189,7 +207,7 @@ fn check_network(config: &ModelConfig) {
     let device = super::device().autodiff();
     let batch = FixtureBatch::read(&device);
     let model = network(config, &fixture, &device);
-    let train = check_first_step(&model, &batch, reading, &fixture);
+    let train = check_first_step(&model, &batch, reading, &fixture, GRADIENT);
 
     // New models, because the forward pass above changed the running statistics of the first one.
     let stepped = |ops| {
@@ -224,6 +242,7 @@ fn check_first_step(
     batch: &FixtureBatch,
     reading: Reading,
     fixture: &Fixture,
+    gradient: Tolerance,
 ) -> String {
     let output = batch.output(model);
     let loss = batch.loss(model.ops(), output.clone());
@@ -247,11 +266,11 @@ fn check_first_step(
             // Zero by construction: the same share of the largest gradient of the convolution's
             // weights.
             Tolerance {
-                absolute: GRADIENT.of_largest * largest(&expected[&name.replace("bias", "weight")]),
-                ..GRADIENT
+                absolute: gradient.of_largest * largest(&expected[&name.replace("bias", "weight")]),
+                ..gradient
             }
         } else {
-            GRADIENT
+            gradient
         };
         worst = worst.max(assert_close(
             &format!("gradient of {name}"),
@@ -276,8 +295,7 @@ fn check_adam(
     let device = super::device();
     let adam_tolerance = match ops.on(&device) {
         Ops::Kernels => ADAM_ON_KERNELS,
-        // Only `flex` has kernels.
-        Ops::Burn if Ops::Kernels.on(&device) == Ops::Kernels => ADAM,
+        Ops::Burn if has_kernels(&device) => ADAM,
         Ops::Burn => ADAM_ON_OTHER_DEVICES,
     };
     let [mut worst, mut worst_mean] = [0.0f32; 2];
@@ -293,6 +311,11 @@ fn check_adam(
         }
     }
     format!("Adam {worst:.3}, running means {worst_mean:.3}")
+}
+
+/// Whether the kernels of `demc-kernels` run on this device: on `flex` only.
+fn has_kernels(device: &Device) -> bool {
+    Ops::Kernels.on(device) == Ops::Kernels
 }
 
 /// The weights by name after [`STEPS`] on the batch.
