@@ -163,7 +163,7 @@ mod tests {
     }
 
     fn every_network(check: impl Fn(ModelConfig)) {
-        for (size, guides) in UnetSize::ALL.into_iter().zip(Guides::ALL) {
+        for (size, guides) in UnetSize::ALL.into_iter().zip(Guides::ALL.into_iter().cycle()) {
             for head in [Head::Grey, Head::Mixed] {
                 check(ModelConfig {
                     variant: Variant::Unet,

@@ -14,7 +14,7 @@ const NORMAL: usize = 0;
 /// First of the three feature channels with the albedo at the first hit.
 const ALBEDO: usize = 6;
 
-/// The sizes that OIDN ships.
+/// The sizes that OIDN ships, and one between them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum UnetSize {
@@ -23,6 +23,8 @@ pub enum UnetSize {
     /// 0.9 million parameters, OIDN's quality `high` with noisy guides.
     #[default]
     Base,
+    /// 2.2 million parameters: the large one with three quarters of its channels.
+    Medium,
     /// 3.8 million parameters, OIDN's quality `high` with clean guides.
     Large,
 }
@@ -55,7 +57,12 @@ pub struct UnetSpec {
 
 impl UnetSize {
     /// All sizes, smallest first.
-    pub const ALL: [UnetSize; 3] = [UnetSize::Small, UnetSize::Base, UnetSize::Large];
+    pub const ALL: [UnetSize; 4] = [
+        UnetSize::Small,
+        UnetSize::Base,
+        UnetSize::Medium,
+        UnetSize::Large,
+    ];
 
     pub(crate) fn is_default(&self) -> bool {
         *self == Self::default()
@@ -75,6 +82,12 @@ impl UnetSize {
                 encoder: [&[32, 32], &[48], &[64], &[80]],
                 bottom: [96, 96],
                 decoder: [[112, 112], [96, 96], [64, 64], [64, 32]],
+            },
+            UnetSize::Medium => &UnetSpec {
+                name: "medium",
+                encoder: [&[48, 48], &[80, 80], &[96, 96], &[144, 144]],
+                bottom: [192, 192],
+                decoder: [[144, 144], [96, 96], [80, 80], [48, 48]],
             },
             UnetSize::Large => &UnetSpec {
                 name: "large",

@@ -66,7 +66,7 @@ fn their_name(ours: &str, size: UnetSize) -> String {
     let parts: Vec<&str> = ours.split('.').collect();
     let index = |part: &str| part.parse::<usize>().expect("an index");
     let letter = |part: &str| ["a", "b"][index(part)];
-    let large = size == UnetSize::Large;
+    let large = matches!(size, UnetSize::Medium | UnetSize::Large);
     let layer = match parts[..] {
         ["encoder", level, "convs", conv, _] if large => {
             format!("enc_conv{}{}", index(level) + 1, letter(conv))
@@ -127,6 +127,7 @@ mod tests {
         for (size, expected) in [
             (UnetSize::Small, base),
             (UnetSize::Base, base),
+            (UnetSize::Medium, large),
             (UnetSize::Large, large),
         ] {
             let expected = expected

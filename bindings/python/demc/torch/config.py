@@ -65,7 +65,7 @@ class ModelConfig:
     levels: tuple[int, ...] = LEVEL_FACTORS
     head: str = "grey"
     detail: str = "open"
-    size: str = "base"  # of a U-Net: small, base, or large
+    size: str = "base"  # of a U-Net: small, base, medium, or large
     guides: str = "albedo-normal"  # of a U-Net: none, albedo, or albedo-normal
 
     def __post_init__(self) -> None:
@@ -74,7 +74,7 @@ class ModelConfig:
             ("reading", self.reading, READINGS),
             ("head", self.head, ("grey", "xavier", "kernel", "mixed")),
             ("detail", self.detail, ("open", "xavier")),
-            ("size", self.size, ("small", "base", "large")),
+            ("size", self.size, ("small", "base", "medium", "large")),
             ("guides", self.guides, ("none", "albedo", "albedo-normal")),
         ):
             if value not in known:
