@@ -5,6 +5,7 @@ skipped, unless DEMC_REQUIRE_EXAMPLES=1.
 """
 
 import importlib.util
+import itertools
 import json
 import os
 import shutil
@@ -80,6 +81,27 @@ class Examples(unittest.TestCase):
                     changed += not np.array_equal(mine, noisy.channels[name].pixels)
                 self.assertEqual(changed, 3)
 
+    def unet_model(self) -> Path:
+        """A random U-Net whose image is not black, with light restored and the albedo filter of a bundled model."""
+        import demc.torch
+        import torch
+        from safetensors.torch import save_file
+
+        bundle = demc.torch.load(self.models["torch"])
+        torch.manual_seed(5)
+        config = demc.torch.ModelConfig("unet", size="small")
+        bundle.model = demc.torch.Unet(config)
+        with torch.no_grad():
+            for weight in bundle.model.head.parameters():
+                weight.copy_(0.1 * weight.abs() + 1e-3)
+        normalizer = bundle.meta["normalizer"] | {"transfer": "pu", "exposure_level": 0.18, "restore_light": True}
+        normalizer.pop("demodulate", None)
+        normalizer["features"] = {"mean": [0.0] * 12, "std": [1.0] * 12}
+        meta = bundle.meta | {"model": asdict(config), "normalizer": normalizer}
+        path = self.folder / "unet.safetensors"
+        save_file(bundle.tensors(), path, {"demc": json.dumps(meta)})
+        return path
+
     def kernel_model(self) -> Path:
         """A random network whose kernels differ from pixel to pixel, with the albedo filter of a bundled model."""
         import demc.torch
@@ -101,9 +123,10 @@ class Examples(unittest.TestCase):
         import numpy as np
         from demc.torch.exr import ExrFile
 
-        model, expected, found = self.kernel_model(), self.folder / "rust.exr", self.folder / "torch.exr"
+        expected, found = self.folder / "rust.exr", self.folder / "torch.exr"
         layers = "--layers", "*.A", "--layers", "*Depth*"
-        for name in ("cycles-4.5", "cycles-alpha"):
+        files = "cycles-4.5", "cycles-alpha"
+        for model, name in itertools.product((self.kernel_model(), self.unet_model()), files):
             source = RENDERERS / f"{name}.exr"
             options = "--model", model, "--overwrite", "--precision", "float", *layers
             self.succeed("demc-infer", "denoise", source, "-o", expected, *options)
@@ -112,7 +135,7 @@ class Examples(unittest.TestCase):
             changed = []
             for channel in theirs:
                 mine, other = ours[channel].pixels, theirs[channel].pixels
-                with self.subTest(name, channel=channel):
+                with self.subTest(name, model=model.name, channel=channel):
                     self.assertLessEqual(np.abs(mine - other).max(), TOLERANCE * np.abs(other).max())
                 changed += [channel] if not np.array_equal(mine, noisy[channel].pixels) else []
             self.assertEqual(len([x for x in changed if x.endswith((".A", "Depth.Z"))]), 2, changed)
