@@ -337,7 +337,7 @@ pub unsafe extern "C" fn demcSetFilterWarningFunction(
 /// includes the bytes between samples. On errors, no output is written.
 ///
 /// Errors:
-/// - DEMC_ERROR_INVALID_OPERATION: a required image is not set; the model has no layers; the call
+/// - DEMC_ERROR_INVALID_OPERATION: a required image is not set; the model denoises no layers; the call
 ///   comes from a function that an execution calls.
 /// - DEMC_ERROR_INVALID_ARGUMENT: images of different sizes; NaN or infinite samples; samples of an
 ///   output that share memory; features far from the training images.
