@@ -69,7 +69,7 @@ impl Bundle {
     /// Number of images of three channels that the kernels filter for this number of layers.
     pub(super) fn filtered_images(&self, layers: usize) -> usize {
         if self.filters_layers() {
-            layer_images(layers)
+            image_count(layers)
         } else {
             0
         }
@@ -102,7 +102,7 @@ pub(super) fn check_layer_sizes(layers: &[Layer], expected: usize) -> Result<(),
 }
 
 /// Number of images of three channels that hold this number of layers.
-fn layer_images(layers: usize) -> usize {
+fn image_count(layers: usize) -> usize {
     layers.div_ceil(COLOR_CHANNELS)
 }
 
@@ -141,7 +141,7 @@ impl<'a> LayerTile<'a> {
     /// # Shapes
     /// Returns `[images, 3, rows, columns]`.
     pub(super) fn input(&self, padding: Padding, device: &Device) -> Tensor<4> {
-        let images = layer_images(self.layers.len());
+        let images = image_count(self.layers.len());
         let mut planes = Vec::with_capacity(images * COLOR_CHANNELS * self.pixels());
         for layer in self.layers {
             let (rows, columns) = (self.rows.clone(), self.columns.clone());
