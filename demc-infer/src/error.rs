@@ -4,7 +4,6 @@ use burn::tensor::TensorReadError;
 use demc_data::image::exr::{UnsupportedSize, check_size};
 use demc_data::input::kpcn::PASS_PLANES;
 use demc_data::{FEATURES, Frame};
-use demc_model::Head;
 use demc_model::config::COLOR_CHANNELS;
 use demc_model::metrics::ImageError;
 
@@ -36,7 +35,7 @@ pub enum DenoiseError {
     /// The image does not fit into memory.
     #[error("{name}")]
     Memory { name: String, source: TooLarge },
-    /// The layers cannot be filtered.
+    /// The layers cannot be denoised.
     #[error("{name}")]
     Layers { name: String, source: LayersError },
     /// A frame without the passes of KPCN.
@@ -90,23 +89,17 @@ pub enum DenoiseError {
     NoReference { name: String },
 }
 
-/// Why layers cannot be filtered.
+/// Why layers cannot be denoised.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[allow(missing_docs, reason = "the messages explain the fields")]
 pub enum LayersError {
-    /// The network makes colours instead of kernels.
+    /// The network denoises diffuse and specular light.
+    #[error("a kpcn model denoises no layers: it takes diffuse and specular light, not images")]
+    Kpcn,
+    /// Test-time augmentation with a kernel head.
     #[error(
-        "layers need a model with model.head = \"{}\" or \"{}\", whose kernels filter them; this \
-         one has \"{}\"",
-        Head::Kernel.name(),
-        Head::Mixed.name(),
-        found.name()
-    )]
-    Head { found: Head },
-    /// Test-time augmentation.
-    #[error(
-        "layers need a single pass, not the mean of {count}: it is taken in gamma space, where \
-         layers do not add up"
+        "layers of a kernel head need a single pass, not the mean of {count}: it is taken in gamma \
+         space, where layers do not add up"
     )]
     Ensemble { count: usize },
     /// A layer does not have the frame's size.

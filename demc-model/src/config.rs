@@ -70,8 +70,6 @@ pub enum Head {
     /// Kernels: the network predicts the weights with which noisy pixels are averaged, on four
     /// scales (Bako et al. 2017, Vogels et al. 2018). See [`crate::kernel_head`].
     Kernel,
-    /// A U-Net's image, blended with that of predicted kernels. See [`crate::mixed_head`].
-    Mixed,
 }
 
 impl Head {
@@ -81,7 +79,6 @@ impl Head {
             Head::Grey => "grey",
             Head::Xavier => "xavier",
             Head::Kernel => "kernel",
-            Head::Mixed => "mixed",
         }
     }
 
@@ -219,7 +216,7 @@ impl fmt::Display for ModelConfig {
 }
 
 impl ModelConfig {
-    /// The U-Net that this one contains: without mixed head and second encoder. `None` for other variants.
+    /// The U-Net that this one contains: without the second encoder. `None` for other variants.
     pub fn trunk(&self) -> Option<ModelConfig> {
         self.variant.is_unet().then(|| ModelConfig {
             variant: Variant::Unet,

@@ -84,7 +84,7 @@ fn share_of_pixels(level: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Head, LEVELS, Reading, Variant};
+    use crate::config::{LEVELS, Reading, Variant};
     use crate::kernel_head::KERNEL_LEVELS;
     use crate::unet::{Guides, UNET_LEVELS, UnetSize};
     use burn::tensor::Device;
@@ -163,16 +163,16 @@ mod tests {
     }
 
     fn every_network(check: impl Fn(ModelConfig)) {
-        for (size, guides) in UnetSize::ALL.into_iter().zip(Guides::ALL.into_iter().cycle()) {
-            for head in [Head::Grey, Head::Mixed] {
-                check(ModelConfig {
-                    variant: Variant::Unet,
-                    size,
-                    guides,
-                    head,
-                    ..ModelConfig::default()
-                });
-            }
+        for (size, guides) in UnetSize::ALL
+            .into_iter()
+            .zip(Guides::ALL.into_iter().cycle())
+        {
+            check(ModelConfig {
+                variant: Variant::Unet,
+                size,
+                guides,
+                ..ModelConfig::default()
+            });
         }
         for variant in Variant::ALL {
             for reading in Reading::ALL {
@@ -244,8 +244,7 @@ mod tests {
                 level: 0,
             },
             ["decoder", "head", ..] => Stage::Head { level: 0 },
-            ["mixed", "gate", _] => Stage::Head { level: 0 },
-            ["decoder" | "mixed", "kernels", index, ..] => Stage::Head {
+            ["decoder", "kernels", index, ..] => Stage::Head {
                 level: KERNEL_LEVELS - 1 - number(index),
             },
             _ => panic!("{name}"),

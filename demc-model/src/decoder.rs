@@ -42,7 +42,7 @@ impl Decoder {
         let init = match config.head {
             Head::Grey => Some((Init::Xavier(GREY_HEAD_SCALE), Init::Color(head_bias))),
             Head::Xavier => Some((Init::Xavier(1.0), Init::Zeros)),
-            Head::Kernel | Head::Mixed => None,
+            Head::Kernel => None,
         };
         let head = init
             .map(|(weight, bias)| {
@@ -54,7 +54,7 @@ impl Decoder {
             .transpose()?;
         let kernels = match config.head {
             Head::Kernel => kernel_head::build(b, &channels)?,
-            Head::Grey | Head::Xavier | Head::Mixed => Vec::new(),
+            Head::Grey | Head::Xavier => Vec::new(),
         };
         Ok(Decoder {
             levels,

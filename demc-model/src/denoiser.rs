@@ -125,11 +125,8 @@ impl Denoiser {
 
     /// Whether the network filters layers of the image, too: whether its head predicts kernels.
     pub fn filters_layers(&self) -> bool {
-        match &self.body {
-            Body::DualEncoder(network) => network.decoder.head.is_none(),
-            Body::Unet(network) => network.mixed.is_some(),
-            Body::Kpcn(_) => false,
-        }
+        let network = self.dual_encoder();
+        network.is_some_and(|network| network.decoder.head.is_none())
     }
 
     /// Visits all parameters. Their paths are the names of the weights, without the body's.

@@ -26,15 +26,15 @@ impl Denoiser {
         done.expect("nobody cancels").0
     }
 
-    /// As [`forward`](Self::forward), for one image without autodiff. The kernels of a kernel head or a
-    /// mixed one also filter `layers`, which are divided by the albedo as the colour is, but stay linear.
+    /// As [`forward`](Self::forward), for one image without autodiff. The kernels of a kernel head
+    /// also filter `layers`, which are divided by the albedo as the colour is, but stay linear.
     ///
     /// # Shapes
     /// `color` `[1, 3, H, W]`, `features` `[1, 12, H, W]`, `layers` `[L, 3, H, W]` in linear
     /// light, of either sign. Returns the denoised `color` and `layers`.
     ///
     /// # Panics
-    /// If the tensors have other shapes, or the network has no kernels.
+    /// If the tensors have other shapes, or the network has no kernel head.
     pub fn forward_with_layers(
         &self,
         color: Tensor<4>,
@@ -77,9 +77,10 @@ impl Denoiser {
             }
             Body::Kpcn(networks) => Ok((networks.forward(color, features, self.ops()), None)),
             Body::Unet(network) if self.infers_on(&network.device(), &color.device()) => {
-                inference::forward_unet(network, [color, features], layers, observer)
+                let out = inference::forward_unet(network, color, features, observer)?;
+                Ok((out, None))
             }
-            Body::Unet(network) => Ok(network.forward([color, features], layers, self.ops())),
+            Body::Unet(network) => Ok((network.forward(color, features, self.ops()), None)),
         }
     }
 

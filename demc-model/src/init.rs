@@ -26,8 +26,6 @@ pub enum Init {
     Bilinear,
     /// `[I I I]` (Eq. 3): the skip fusion starts as the sum of its inputs.
     IdentitySum,
-    /// The same value everywhere: the bias of a gate.
-    Filled(f32),
     /// `[I 0]`: a fusion that starts as its first input.
     IdentityFirst,
     /// Three given values: the bias of a grey head or of an open detail map.
@@ -60,7 +58,6 @@ impl Init {
                 identity_blocks(shape, input / out)
             }
             Init::IdentityFirst => identity_blocks(shape, 1),
-            Init::Filled(value) => vec![value; len],
             Init::Color(values) => {
                 assert_eq!(shape, [3], "a colour has three channels");
                 values.to_vec()

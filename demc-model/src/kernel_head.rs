@@ -58,32 +58,24 @@ pub(crate) fn forward(
     color_gamma: Maps,
     layers: Option<Maps>,
 ) -> (Maps, Option<Maps>) {
-    let (color, layers) = filtered(kernels, decoded, color_gamma.radiance(GAMMA), layers);
+    let color = color_gamma.radiance(GAMMA);
+    let (color, layers) = match layers {
+        None => (filtered(kernels, decoded, color), None),
+        Some(layers) => {
+            let images = Maps::cat_images(vec![color, layers]);
+            let (color, layers) = filtered(kernels, decoded, images).split_first();
+            (color, Some(layers))
+        }
+    };
     (color.gamma(GAMMA, DARKEST), layers)
 }
 
-/// Colour and layers in linear light, filtered on all scales.
+/// Images in linear light, filtered on all scales.
 ///
 /// # Shapes
-/// `decoded`: the decoder's maps, deepest first, of which the last [`KERNEL_LEVELS`] count. Colour
-/// `[B, 3, H, W]` and layers `[L, 3, H, W]`, for B = 1, to the same.
-pub(crate) fn filtered(
-    kernels: &[Conv2d],
-    decoded: Vec<Maps>,
-    color: Maps,
-    layers: Option<Maps>,
-) -> (Maps, Option<Maps>) {
-    match layers {
-        None => (filtered_images(kernels, decoded, color), None),
-        Some(layers) => {
-            let images = Maps::cat_images(vec![color, layers]);
-            let (color, layers) = filtered_images(kernels, decoded, images).split_first();
-            (color, Some(layers))
-        }
-    }
-}
-
-fn filtered_images(kernels: &[Conv2d], decoded: Vec<Maps>, images: Maps) -> Maps {
+/// `decoded`: the decoder's maps, deepest first, of which the last [`KERNEL_LEVELS`] count. Images
+/// `[B, 3, H, W]` to the same.
+fn filtered(kernels: &[Conv2d], decoded: Vec<Maps>, images: Maps) -> Maps {
     let mut scales = vec![images];
     for _ in 1..KERNEL_LEVELS {
         scales.push(scales[scales.len() - 1].clone().halve());

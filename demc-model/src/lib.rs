@@ -10,8 +10,8 @@
 //! five times and fuses the encoders' skips at each level. The layers run on one of two
 //! implementations ([`ops`]): our CPU kernels or Burn's operations.
 //!
-//! [`kpcn`] and [`unet`] are networks of others: one to compare with, one to start from. A [`mixed_head`] and
-//! a [`side_encoder`] grow from the latter.
+//! [`kpcn`] and [`unet`] are networks of others: one to compare with, one to start from. A [`side_encoder`]
+//! may stand beside the latter.
 //!
 //! Tensors are NCHW and float32; height and width are multiples of [`DOWNSAMPLING`]. `demc-data`
 //! provides files, statistics and patches.
@@ -31,7 +31,6 @@ pub mod kpcn;
 pub mod layers;
 pub mod loss;
 pub mod metrics;
-pub mod mixed_head;
 pub mod ops;
 pub mod pu;
 pub mod side_encoder;

@@ -10,10 +10,9 @@ use burn::module::Module;
 use burn::nn::conv::Conv2d;
 use burn::tensor::{Device, Tensor};
 
-use crate::config::{COLOR_CHANNELS, Head, ModelConfig};
+use crate::config::{COLOR_CHANNELS, ModelConfig};
 use crate::init::Init;
 use crate::layers::{ConvStack, conv3x3};
-use crate::mixed_head::MixedHead;
 use crate::ops::{Activation, Maps, Ops};
 use crate::side_encoder::SideEncoder;
 pub use crate::unet_size::{Guides, UNET_LEVELS, UnetSize, UnetSpec};
@@ -30,8 +29,6 @@ pub struct Unet {
     pub decoder: Vec<ConvStack>,
     /// The convolution to colour.
     pub head: Conv2d,
-    /// What a mixed head has beside that.
-    pub mixed: Option<MixedHead>,
     /// The encoder of the features, if the variant has one.
     pub side: Option<SideEncoder>,
     #[module(skip)]
@@ -74,9 +71,6 @@ impl Unet {
         })?;
         let mut decoded = spec.decoder.map(|outputs| outputs[1]);
         decoded.reverse();
-        let mixed = (config.head == Head::Mixed)
-            .then(|| b.part("mixed", |b| MixedHead::build(b, &decoded)))
-            .transpose()?;
         let input = config.variant.spec().side;
         let side = input
             .map(|input| {
@@ -90,7 +84,6 @@ impl Unet {
             bottom,
             decoder,
             head,
-            mixed,
             side,
             guides: config.guides,
         })
@@ -114,23 +107,17 @@ impl Unet {
         Some(fusion.forward(Maps::from_nchw(features, ops)).into_nchw())
     }
 
-    /// Denoises colour with guides, both in OIDN's value ranges, and layers with the kernels of a mixed head.
+    /// Denoises colour with guides, both in OIDN's value ranges.
     ///
     /// # Shapes
     /// `color` `[B, 3, H, W]`; `features` `[B, 12, H, W]`, of which the guides count, with a second encoder
-    /// all; H and W multiples of 16; `layers` `[L, 3, H, W]` in linear light, for B = 1. Returns the shapes of
-    /// `color`, not negative, and `layers`.
-    pub fn forward(
-        &self,
-        [color, features]: [Tensor<4>; 2],
-        layers: Option<Tensor<4>>,
-        ops: Ops,
-    ) -> (Tensor<4>, Option<Tensor<4>>) {
+    /// all; H and W multiples of 16. Returns the shape of `color`, not negative.
+    pub fn forward(&self, color: Tensor<4>, features: Tensor<4>, ops: Ops) -> Tensor<4> {
         let side = self
             .side
             .as_ref()
             .map(|side| (side, side.forward(Maps::from_nchw(features.clone(), ops))));
-        let mut inputs = vec![color.clone()];
+        let mut inputs = vec![color];
         for first in self.guides.first_channels() {
             inputs.push(features.clone().narrow(1, *first, COLOR_CHANNELS));
         }
@@ -141,23 +128,13 @@ impl Unet {
             x = level.forward(x).max_pool();
         }
         x = self.bottom.forward(x);
-        let mut decoded = Vec::with_capacity(UNET_LEVELS);
         for (index, level) in self.decoder.iter().enumerate() {
             let skip = skips.pop().expect("a skip for each level");
             x = level.forward(x.double_and_append(skip));
             if let Some((side, maps)) = &side {
                 x = side.fuse(index, x, maps[index].clone());
             }
-            decoded.push(x.clone());
         }
-        let direct = x.conv3x3(&self.head, Activation::Relu);
-        let (out, layers) = match &self.mixed {
-            Some(mixed) => {
-                let layers = layers.map(|layers| Maps::from_nchw(layers, ops));
-                mixed.forward(direct, decoded, Maps::from_nchw(color, ops), layers)
-            }
-            None => (direct, None),
-        };
-        (out.into_nchw(), layers.map(Maps::into_nchw))
+        x.conv3x3(&self.head, Activation::Relu).into_nchw()
     }
 }

@@ -108,14 +108,13 @@ pub unsafe extern "C" fn demcReleaseFilter(filter: DemcFilter) {
 /// "output"           3         denoised colour: linear HDR radiance, not negative
 /// "alpha"            1         noisy alpha, 0 to 1
 /// "outputAlpha"      1         denoised alpha
-/// "layer:NAME"       1 or 3    a further image to filter with the colour's kernels
-/// "outputLayer:NAME" 1 or 3    that layer, filtered
+/// "layer:NAME"       1 or 3    a further image to denoise, such as a light group
+/// "outputLayer:NAME" 1 or 3    that layer, denoised
 /// ```
 ///
 /// "color" and "output" are required, and the features as the model needs them. The bundled models
-/// need normal and albedo. Without position, they use zeros; without albedo2, the albedo. Layers
-/// need a model with a kernel head, as the bundled ones have, or a mixed one. A layer of 3 channels is
-/// light, and one of 1 channel is a mask.
+/// need normal and albedo. Without position, they use zeros; without albedo2, the albedo. All models
+/// but those of KPCN denoise layers. A layer of 3 channels is light, and one of 1 channel is a mask.
 ///
 /// `data` is the caller's memory. It must stay valid until the last execution with it has ended. An
 /// output may be the same image as an input, because outputs are written last.
@@ -338,7 +337,7 @@ pub unsafe extern "C" fn demcSetFilterWarningFunction(
 /// includes the bytes between samples. On errors, no output is written.
 ///
 /// Errors:
-/// - DEMC_ERROR_INVALID_OPERATION: a required image is not set; the model has no layers; the call
+/// - DEMC_ERROR_INVALID_OPERATION: a required image is not set; the model denoises no layers; the call
 ///   comes from a function that an execution calls.
 /// - DEMC_ERROR_INVALID_ARGUMENT: images of different sizes; NaN or infinite samples; samples of an
 ///   output that share memory; features far from the training images.

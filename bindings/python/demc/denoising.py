@@ -96,7 +96,7 @@ class Model:
 
     @property
     def takes_layers(self) -> bool:
-        """Whether `denoise` accepts layers: the network predicts kernels."""
+        """Whether `denoise` accepts layers: all models but those of KPCN do."""
         return self._bundle.takes_layers()
 
     def input_scale(self, color: ArrayLike) -> float:
@@ -182,12 +182,13 @@ def denoise(
         albedo: albedo of the first hit.
         albedo2: albedo of the second hit; by default that of the first hit.
         alpha: alpha of the colour (height, width), 0 to 1, denoised with it.
-        layers: further channels by name, (height, width) or three channels, that the colour's
-            kernels filter. Layers that add up to the colour still do. A plane whose name ends in
-            `.R`, `.G`, or `.B` belongs to that channel of the colour. Needs `Model.takes_layers`.
+        layers: further channels by name, (height, width) or three channels, that are denoised
+            beside the colour. Layers that add up to it still do. A plane whose name ends in `.R`,
+            `.G`, or `.B` belongs to that channel of the colour. Needs `Model.takes_layers`.
         model: a `Model`, or what `Model.load` takes.
         out: array for the result, with the shape of `color`; may be `color` itself.
-        passes: mean of 1, 4, or 8 passes over flipped and transposed copies. Layers need 1.
+        passes: mean of 1, 4, or 8 passes over flipped and transposed copies. Layers of a kernel head
+            need 1.
         input_scale: factor on the colour before the network; by default `Model.input_scale(color)`.
         restore_light: whether the result gets the light of the noisy image; by default as the model
             says.

@@ -32,7 +32,7 @@ def denoise_exr(
         target: file to write.
         model: `quality`, `fast`, a run directory, a checkpoint, or an exported file.
         layout: preset or TOML file of the channels; by default the one that fits.
-        layers: names or glob patterns of further channels to denoise. Needs a kernel or mixed head.
+        layers: names or glob patterns of further channels to denoise; not with a KPCN model.
         repair: whether NaN, infinite, and negative samples are replaced by the median around them.
         overwrite: whether an existing target is replaced. One that was made with these options stays as it is.
 

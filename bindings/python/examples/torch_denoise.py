@@ -13,7 +13,7 @@ for name in ("model", "input", "output"):
     parser.add_argument(name)
 parser.add_argument("--layout", help="preset or TOML file of the channels; default: the one that fits")
 parser.add_argument("--layer", help="view layer, for a file with several")
-parser.add_argument("--layers", action="append", default=[], metavar="PATTERN", help="also denoise these channels; needs a kernel head")
+parser.add_argument("--layers", action="append", default=[], metavar="PATTERN", help="also denoise these channels")
 arguments = parser.parse_args()
 
 try:

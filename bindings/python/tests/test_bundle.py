@@ -193,10 +193,56 @@ class Headers(unittest.TestCase):
         lit = {"x.g": 0.5 * (features[7] + 0.07)}
         np.testing.assert_allclose(bundle.denoise_with_layers(color, features, lit)[1]["x.g"], lit["x.g"], rtol=1e-5)
 
-    def test_layers_that_cannot_be_filtered_are_refused(self) -> None:
+    def plain_bundle(self, variant: str) -> demc.torch.Bundle:
+        """A network without kernels that restores light; DEMC also demodulates."""
+        torch.manual_seed(5)
+        width = 64 if variant == "unet" else 2
+        config = demc.torch.ModelConfig(variant, width=width, size="small")
+        model = (demc.torch.Denoiser if variant == "demc" else demc.torch.Unet)(config)
+        own = {"demodulate": 0.07} if variant == "demc" else {"transfer": "pu"}
+        with torch.no_grad():
+            for weight in [] if variant == "demc" else model.head.parameters():
+                # The image is not black, and its radiance not beyond floats.
+                weight.copy_(0.1 * weight.abs() + 1e-3)
+        self.weights = model.state_dict()
+        self.meta["model"] = asdict(config)
+        self.meta["normalizer"] |= own | {"exposure_level": 0.18, "restore_light": True}
         self.write()
+        return demc.torch.load(self.path)
+
+    def test_layers_of_a_network_without_kernels_are_images(self) -> None:
+        random = np.random.default_rng(2)
+        passes = 5 * random.random((2, 3, 40, 70), np.float32) ** 8 * np.float32([[[[1]]], [[[20]]]])
+        color, features = passes.sum(0), random.random((12, 40, 70), np.float32)
+        for variant in ("demc", "unet", "unet-nosn"):
+            bundle = self.plain_bundle(variant)
+            # Blue comes first, as in files.
+            key, rim = ({f"{name}.{end}": light[i] for i, end in ((2, "B"), (1, "g"), (0, "R"))} for name, light in zip(("key", "rim"), passes))
+            image, filtered = bundle.denoise_with_layers(color, features, key | {"A": color[0]} | rim)
+            np.testing.assert_array_equal(image, bundle.denoise(color, features))
+            self.assertEqual(list(filtered), [*key, "A", *rim])
+            total = sum(np.stack([filtered[f"{name}.{end}"] for end in "RgB"]) for name in ("key", "rim"))
+            self.assertLessEqual(abs(total - image).max(), 1e-4 * image.max())
+            # A light alone is not the colour. Its result is that of an image.
+            _, alone = bundle.denoise_with_layers(color, features, rim)
+            expected = bundle.denoise(passes[1], features)
+            np.testing.assert_array_equal(np.stack([alone[name] for name in ("rim.R", "rim.g", "rim.B")]), expected)
+            bundle.demodulate = 0
+            grey = bundle.denoise(np.stack([color[0]] * 3), features).mean(0)
+            np.testing.assert_array_equal(filtered["A"], grey)
+
+    def test_layers_with_three_colours_of_a_name_are_an_image(self) -> None:
+        names = ["key.B", "A", "key.G", "rim.r", "key.R", "rim.G", "rim.b", "R", "B", "G", "key.r", "fill.R", "fill.G"]
+        images = [("key.R", "key.G", "key.B"), ("A",), ("rim.r", "rim.G", "rim.b"), ("R", "G", "B")]
+        images += [("key.r",), ("fill.R",), ("fill.G",)]
+        self.assertEqual(demc.torch.layers.layer_images(names), images)
+
+    def test_layers_that_cannot_be_denoised_are_refused(self) -> None:
         color, features = np.ones((3, 8, 8)), np.ones((12, 8, 8))
-        with self.assertRaisesRegex(ValueError, 'head "kernel"; this one has "grey"'):
+        self.meta["model"] |= {"variant": "kpcn"}
+        self.weights = demc.torch.Kpcn(demc.torch.ModelConfig("kpcn", width=2)).state_dict()
+        self.write()
+        with self.assertRaisesRegex(ValueError, "a kpcn model denoises no layers"):
             demc.torch.load(self.path).denoise_with_layers(color, features, {"A": color[0]})
         bundle = self.kernel_bundle()
         for plane, words in ((np.ones((8, 7)), r"\[8, 7\]: expected \[8, 8\]"), (np.full((8, 8), np.nan), "NaN")):

@@ -5,6 +5,7 @@ skipped, unless DEMC_REQUIRE_EXAMPLES=1.
 """
 
 import importlib.util
+import itertools
 import json
 import os
 import shutil
@@ -80,6 +81,27 @@ class Examples(unittest.TestCase):
                     changed += not np.array_equal(mine, noisy.channels[name].pixels)
                 self.assertEqual(changed, 3)
 
+    def unet_model(self) -> Path:
+        """A random U-Net whose image is not black, with light restored and the albedo filter of a bundled model."""
+        import demc.torch
+        import torch
+        from safetensors.torch import save_file
+
+        bundle = demc.torch.load(self.models["torch"])
+        torch.manual_seed(5)
+        config = demc.torch.ModelConfig("unet", size="small")
+        bundle.model = demc.torch.Unet(config)
+        with torch.no_grad():
+            for weight in bundle.model.head.parameters():
+                weight.copy_(0.1 * weight.abs() + 1e-3)
+        normalizer = bundle.meta["normalizer"] | {"transfer": "pu", "exposure_level": 0.18, "restore_light": True}
+        normalizer.pop("demodulate", None)
+        normalizer["features"] = {"mean": [0.0] * 12, "std": [1.0] * 12}
+        meta = bundle.meta | {"model": asdict(config), "normalizer": normalizer}
+        path = self.folder / "unet.safetensors"
+        save_file(bundle.tensors(), path, {"demc": json.dumps(meta)})
+        return path
+
     def kernel_model(self) -> Path:
         """A random network whose kernels differ from pixel to pixel, with the albedo filter of a bundled model."""
         import demc.torch
@@ -97,14 +119,31 @@ class Examples(unittest.TestCase):
         save_file(bundle.tensors(), path, {"demc": json.dumps(bundle.meta | {"model": asdict(config)})})
         return path
 
+    def file_with_groups(self, source: Path) -> Path:
+        """Blender's file with two light groups that add up to its colour."""
+        import numpy as np
+        import OpenEXR
+
+        channels = OpenEXR.File(str(source), separate_channels=True).channels()
+        planes = {name: channel.pixels for name, channel in channels.items()}
+        random = np.random.default_rng(3)
+        for end in "RGB":
+            color = np.float32(planes[f"ViewLayer.Combined.{end}"])
+            planes[f"ViewLayer.Combined_key.{end}"] = color * random.uniform(0, 1, color.shape).astype(np.float32)
+            planes[f"ViewLayer.Combined_fill.{end}"] = color - planes[f"ViewLayer.Combined_key.{end}"]
+        path = self.folder / source.name
+        OpenEXR.File({"type": OpenEXR.scanlineimage}, planes).write(str(path))
+        return path
+
     def test_layers_are_those_of_demc_infer(self) -> None:
         import numpy as np
         from demc.torch.exr import ExrFile
 
-        model, expected, found = self.kernel_model(), self.folder / "rust.exr", self.folder / "torch.exr"
-        layers = "--layers", "*.A", "--layers", "*Depth*"
-        for name in ("cycles-4.5", "cycles-alpha"):
-            source = RENDERERS / f"{name}.exr"
+        expected, found = self.folder / "rust.exr", self.folder / "torch.exr"
+        sources = self.file_with_groups(RENDERERS / "cycles-4.5.exr"), RENDERERS / "cycles-alpha.exr"
+        for model, source in itertools.product((self.kernel_model(), self.unet_model()), sources):
+            has_groups = source == sources[0]
+            layers = "--layers", "*.A", "--layers", "*Depth*", *(["--layers", "*_[fk]*"] * has_groups)
             options = "--model", model, "--overwrite", "--precision", "float", *layers
             self.succeed("demc-infer", "denoise", source, "-o", expected, *options)
             self.succeed(sys.executable, PACKAGE / "examples" / "torch_denoise.py", model, source, found, *layers)
@@ -112,10 +151,13 @@ class Examples(unittest.TestCase):
             changed = []
             for channel in theirs:
                 mine, other = ours[channel].pixels, theirs[channel].pixels
-                with self.subTest(name, channel=channel):
+                with self.subTest(source.name, model=model.name, channel=channel):
                     self.assertLessEqual(np.abs(mine - other).max(), TOLERANCE * np.abs(other).max())
                 changed += [channel] if not np.array_equal(mine, noisy[channel].pixels) else []
             self.assertEqual(len([x for x in changed if x.endswith((".A", "Depth.Z"))]), 2, changed)
+            for end in "RGB" if has_groups else "":
+                image, key, fill = (ours[f"ViewLayer.Combined{group}.{end}"].pixels for group in ("", "_key", "_fill"))
+                self.assertLessEqual(np.abs(image - key - fill).max(), TOLERANCE * image.max())
 
     def test_a_mistake_is_one_line(self) -> None:
         for kind in self.models:

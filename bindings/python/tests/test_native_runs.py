@@ -148,17 +148,19 @@ class Layers(Runs):
             self.assertEqual(found.layers["fill"][i].tobytes(), planes.layers[f"fill.{end}"].tobytes())
 
 
-    def test_layers_need_a_kernel_head(self) -> None:
+    def test_layers_of_a_network_without_kernels_add_up_to_the_colour(self) -> None:
         self.train(overrides={"model.head": "grey", "train.steps": 1})
         model = demc.Model.load(self.folder / "run")
-        self.assertFalse(model.takes_layers)
-        grey = np.full((3, 32, 32), 0.5, np.float32)
-        with self.assertRaisesRegex(demc.DemcError, "kernel"):
-            model.denoise(grey, normal=grey, albedo=grey, layers={"key.R": grey[0]})
-        source, output = SAMPLE / "test" / "gen-table-test-1.exr", self.folder / "new.exr"
-        with self.assertRaisesRegex(demc.DemcError, "layers need a model with model.head"):
-            demc.denoise_exr(source, output, model=self.folder / "run", layers=["R"])
-        self.assertFalse(output.exists())
+        self.assertTrue(model.takes_layers)
+        key, fill = np.random.default_rng(1).random((2, 3, 40, 33), np.float32)
+        guides = {"normal": np.full_like(key, 0.577), "albedo": fill}
+        shares = []
+        with warnings.catch_warnings(action="ignore"):
+            found = model.denoise(
+                key + fill, layers={"key": key, "fill": fill}, passes=4, on_progress=shares.append, **guides
+            )
+        np.testing.assert_allclose(found.layers["key"] + found.layers["fill"], found.color, rtol=1e-3, atol=1e-4)
+        self.assertEqual(shares, sorted(shares))
 
 
 class Evaluation(Runs):

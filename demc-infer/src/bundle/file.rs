@@ -327,9 +327,6 @@ fn statistics_problems(meta: &BundleMeta) -> Vec<String> {
             "normalizer.transfer: not gamma, as a kernel head, demodulation, or kpcn needs".into(),
         );
     }
-    if meta.model.head == Head::Mixed && normalizer.transfer.is_gamma() {
-        problems.push("normalizer.transfer: not pu, as a mixed head needs".into());
-    }
     let features = &normalizer.features;
     for (channel, (mean, std)) in FEATURE_NAMES
         .iter()

@@ -20,16 +20,11 @@ pub(crate) fn bundle(variant: Variant) -> Bundle {
 
 /// The network of [`bundle`] with a kernel head, whose kernels differ from pixel to pixel.
 pub(crate) fn kernel_bundle() -> Bundle {
-    bundle_with_kernels(Variant::Demc, Head::Kernel)
-}
-
-/// A model whose head predicts random kernels.
-pub(crate) fn bundle_with_kernels(variant: Variant, head: Head) -> Bundle {
-    let mut bundle = bundle_with(variant, head);
+    let mut bundle = bundle_with(Variant::Demc, Head::Kernel);
     let mut rng = ChaCha8Rng::seed_from_u64(9);
     let mut weights = bundle.model.weights();
     for weight in &mut weights {
-        if weight.name.starts_with("decoder.kernels") || weight.name.starts_with("mixed.") {
+        if weight.name.starts_with("decoder.kernels") {
             let random = |value: &mut f32| *value = rng.random_range(-2.0..2.0);
             weight.data.iter_mut().for_each(random);
         }
@@ -68,15 +63,11 @@ pub(crate) fn bundle_with(variant: Variant, head: Head) -> Bundle {
         mean: std::array::from_fn(|channel| 0.1 * channel as f32),
         std: std::array::from_fn(|channel| 0.3 + 0.1 * channel as f32),
     };
-    let transfer = match head {
-        Head::Mixed => Transfer::Pu,
-        Head::Grey | Head::Xavier | Head::Kernel => Transfer::Gamma,
-    };
     let normalizer = Normalizer {
         gamma: 2.2,
         albedo_demodulation_epsilon: None,
         position: PositionSpace::Scene,
-        transfer,
+        transfer: Transfer::Gamma,
         exposure_level: None,
         restore_light: false,
         features,

@@ -17,8 +17,8 @@ use crate::{Bundle, Ensemble};
 /// `--layers`.
 #[derive(Args)]
 pub struct LayersFlag {
-    /// Also denoise these channels, with the same kernels as the colour: names or glob patterns, such
-    /// as 'ViewLayer.Combined_*'. Needs a model with model.head = "kernel". The flag can be repeated
+    /// Also denoise these channels: names or glob patterns, such as 'ViewLayer.Combined_*'. Layers that
+    /// add up to the colour still do. Not with a KPCN model. The flag can be repeated
     #[arg(long = "layers", value_name = "PATTERN", value_parser = pattern)]
     patterns: Vec<Pattern>,
 }

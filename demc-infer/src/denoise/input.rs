@@ -29,7 +29,7 @@ const ALPHA_LEVEL: f32 = 0.05;
 pub(super) struct FrameInput<'a> {
     pub(super) bundle: &'a Bundle,
     pub(super) frame: &'a Frame,
-    /// The image that is denoised, planar `[3, H, W]`: the frame's colour, or its alpha as grey.
+    /// The image that is denoised, planar `[3, H, W]`: the frame's colour, its alpha as grey, or a layer.
     pub(super) color: &'a [f32],
     /// Channels that are filtered with its kernels.
     pub(super) layers: &'a [Layer],
@@ -239,7 +239,6 @@ impl<'a> FrameInput<'a> {
         let color_gamma = self.tensor::<COLOR_CHANNELS>(color, rows, columns);
         let layers = LayerTile::new(
             self.layers,
-            self.bundle.scales_layers().then_some(self.color),
             modulation.as_deref(),
             normalizer.gamma,
             [rows, columns],
@@ -260,7 +259,7 @@ impl<'a> FrameInput<'a> {
             out.iter_mut().for_each(|value| *value /= self.scale);
         });
         if let Some(filtered) = filtered {
-            out.extend(layers.output(self.read(filtered)?, &out));
+            out.extend(layers.output(self.read(filtered)?));
         }
         Ok(out)
     }

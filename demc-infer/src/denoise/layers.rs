@@ -1,15 +1,11 @@
-//! Layers: further channels of the image, such as light groups or alpha, that the
-//! colour's kernels filter in the same pass.
+//! Layers: further channels of the image, such as light groups or alpha. The kernels of a kernel head
+//! filter them in the same pass. Other networks denoise each as an image of its own (`layer_images`).
 //!
 //! A kernel head is linear in the colour for given kernels, K. A layer x becomes `a K(x / a)`, with the
 //! albedo `a` of its colour channel as in albedo demodulation, or with `a` = 1. So layers whose sum is
 //! the colour still add up to it. Layers are neither clamped nor scaled.
-//!
-//! The image of a mixed head, y, is that of its kernels only in part. There a layer becomes
-//! `K(x) y / K(c)`, with its channel of the noisy colour c. So layers add up to the image again.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use demc_model::Head;
 use demc_model::config::COLOR_CHANNELS;
 use rayon::prelude::*;
 
@@ -21,7 +17,7 @@ use crate::padding::{Padding, PixelRange};
 /// The last parts of names, in any case, of channels that the albedo's red, green, and blue belong to.
 const COLORS: [&str; COLOR_CHANNELS] = ["r", "g", "b"];
 
-/// A channel that is filtered with the kernels of the colour.
+/// A channel that is denoised beside the colour.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Layer {
     /// The channel's name, such as `ViewLayer.Combined_key.R`.
@@ -31,41 +27,65 @@ pub struct Layer {
 }
 
 impl Layer {
-    /// The colour channel whose albedo a model with albedo demodulation divides it by: 0 for a name
-    /// that ends in `R`, 1 in `G`, 2 in `B`; `None` for other names, such as `A`.
+    /// The colour channel that it belongs to: 0 for a name that ends in `R`, 1 in `G`, 2 in `B`;
+    /// `None` for other names, such as `A`.
     pub fn color(&self) -> Option<usize> {
         let last = self.name.rsplit('.').next()?;
         COLORS
             .iter()
             .position(|color| last.eq_ignore_ascii_case(color))
     }
+
+    /// The name without its last part; empty for a name of one part.
+    pub(super) fn group(&self) -> &str {
+        self.name.rsplit_once('.').map_or("", |(group, _)| group)
+    }
 }
 
 impl Bundle {
-    /// Whether this model can filter layers with this number of passes.
+    /// Whether this model can denoise layers with this number of passes.
     ///
     /// # Errors
-    /// Its head predicts no kernels, or there are several passes.
+    /// It is of KPCN, or there are several passes and its head predicts kernels.
     pub fn check_layers(&self, ensemble: Ensemble) -> Result<(), LayersError> {
-        let found = self.meta.model.head;
-        match (found, ensemble) {
-            (Head::Kernel | Head::Mixed, Ensemble::One) => Ok(()),
-            (Head::Kernel | Head::Mixed, _) => Err(LayersError::Ensemble {
-                count: ensemble.count(),
-            }),
-            _ => Err(LayersError::Head { found }),
+        if !self.meta.layout.inputs.is_demc() {
+            return Err(LayersError::Kpcn);
+        }
+        match ensemble {
+            Ensemble::Four | Ensemble::Eight if self.filters_layers() => {
+                Err(LayersError::Ensemble {
+                    count: ensemble.count(),
+                })
+            }
+            _ => Ok(()),
         }
     }
 
-    /// Whether layers are multiplied by the ratio of the image to the filtered colour: with a mixed head.
-    pub(super) fn scales_layers(&self) -> bool {
-        self.meta.model.head == Head::Mixed
+    /// Whether the colour's kernels filter layers in the same pass.
+    pub(super) fn filters_layers(&self) -> bool {
+        self.model.filters_layers()
     }
 
     /// Number of images of three channels that the kernels filter for this number of layers.
-    pub(super) fn layer_images(&self, layers: usize) -> usize {
-        let has_color = layers > 0 && self.scales_layers();
-        (layers + usize::from(has_color) * COLOR_CHANNELS).div_ceil(COLOR_CHANNELS)
+    pub(super) fn filtered_images(&self, layers: usize) -> usize {
+        if self.filters_layers() {
+            image_count(layers)
+        } else {
+            0
+        }
+    }
+
+    /// Number of planes that are in memory for this number of layers, beside a pass.
+    pub(super) fn layer_planes(&self, layers: usize) -> usize {
+        if layers == 0 {
+            0
+        } else if self.filters_layers() {
+            // The layers of all tiles, and again as a plane each.
+            2 * layers
+        } else {
+            // The results; and an image, its denoised one, and factors.
+            layers + 3 * COLOR_CHANNELS
+        }
     }
 }
 
@@ -81,11 +101,14 @@ pub(super) fn check_layer_sizes(layers: &[Layer], expected: usize) -> Result<(),
     })
 }
 
+/// Number of images of three channels that hold this number of layers.
+fn image_count(layers: usize) -> usize {
+    layers.div_ceil(COLOR_CHANNELS)
+}
+
 /// The layers of a tile, and their factors after the network.
 pub(super) struct LayerTile<'a> {
     layers: &'a [Layer],
-    /// The noisy colour `[3, H, W]` for a mixed head, whose image the layers add up to.
-    color: Option<&'a [f32]>,
     /// The factor of albedo demodulation, in gamma space, `[3, rows, columns]`.
     modulation: Option<&'a [f32]>,
     gamma: f32,
@@ -96,14 +119,12 @@ pub(super) struct LayerTile<'a> {
 impl<'a> LayerTile<'a> {
     pub(super) fn new(
         layers: &'a [Layer],
-        color: Option<&'a [f32]>,
         modulation: Option<&'a [f32]>,
         gamma: f32,
         [rows, columns]: [&PixelRange; 2],
     ) -> Self {
         LayerTile {
             layers,
-            color,
             modulation,
             gamma,
             rows: rows.clone(),
@@ -115,61 +136,36 @@ impl<'a> LayerTile<'a> {
         self.rows.len() * self.columns.len()
     }
 
-    /// The network's input: layers divided by the albedo, for a mixed head the noisy colour, and planes of
-    /// zeros to whole images.
+    /// The network's input: layers divided by the albedo, and planes of zeros to whole images.
     ///
     /// # Shapes
     /// Returns `[images, 3, rows, columns]`.
     pub(super) fn input(&self, padding: Padding, device: &Device) -> Tensor<4> {
-        let samples = self.layers.iter().map(|layer| layer.samples.as_slice());
-        let mut planes = Vec::new();
-        for samples in samples.chain(self.color) {
+        let images = image_count(self.layers.len());
+        let mut planes = Vec::with_capacity(images * COLOR_CHANNELS * self.pixels());
+        for layer in self.layers {
             let (rows, columns) = (self.rows.clone(), self.columns.clone());
-            planes.extend(padding.cut(samples, rows, columns));
+            planes.extend(padding.cut(&layer.samples, rows, columns));
         }
-        let images = planes.len().div_ceil(COLOR_CHANNELS * self.pixels());
-        self.for_each_factor(&mut planes, self.albedo(), |value, albedo| *value /= albedo);
+        self.for_each_albedo(&mut planes, |value, albedo| *value /= albedo);
         planes.resize(images * COLOR_CHANNELS * self.pixels(), 0.0);
         let shape = [images, COLOR_CHANNELS, self.rows.len(), self.columns.len()];
         Tensor::from_data(TensorData::new(planes, shape), device)
     }
 
-    /// The layers of the network's output, multiplied by the albedo, for a mixed head by the ratio of the
-    /// image to the filtered colour.
+    /// The layers of the network's output, multiplied by the albedo.
     ///
     /// # Shapes
-    /// `[images, 3, rows, columns]` and the denoised image `[3, rows, columns]` to `[layers, rows, columns]`.
-    pub(super) fn output(&self, mut planes: Vec<f32>, denoised: &[f32]) -> Vec<f32> {
-        let mut others = planes.split_off(self.layers.len() * self.pixels());
-        self.for_each_factor(&mut planes, self.albedo(), |value, albedo| *value *= albedo);
-        if self.color.is_some() {
-            others.truncate(denoised.len());
-            let ratios = others.par_iter_mut().zip(denoised);
-            ratios.for_each(|(filtered, denoised)| {
-                // A tiny filtered value overflows the ratio.
-                let ratio = *denoised / *filtered;
-                let is_valid = *filtered > 0.0 && ratio.is_finite();
-                *filtered = if is_valid { ratio } else { 1.0 };
-            });
-            self.for_each_factor(&mut planes, Some(others), |value, ratio| *value *= ratio);
-        }
+    /// `[images, 3, rows, columns]` to `[layers, rows, columns]`.
+    pub(super) fn output(&self, mut planes: Vec<f32>) -> Vec<f32> {
+        planes.truncate(self.layers.len() * self.pixels());
+        self.for_each_albedo(&mut planes, |value, albedo| *value *= albedo);
         planes
     }
 
-    /// The factor of albedo demodulation in linear light.
-    fn albedo(&self) -> Option<Vec<f32>> {
-        let modulation = self.modulation?.par_iter();
-        Some(modulation.map(|factor| factor.powf(self.gamma)).collect())
-    }
-
-    /// Changes each pixel of the layers by its colour's factor, `[3, rows, columns]`.
-    fn for_each_factor(
-        &self,
-        planes: &mut [f32],
-        factors: Option<Vec<f32>>,
-        change: impl Fn(&mut f32, f32) + Sync,
-    ) {
-        let Some(factors) = factors else {
+    /// Changes each pixel of the layers by its colour's factor of albedo demodulation in linear light.
+    fn for_each_albedo(&self, planes: &mut [f32], change: impl Fn(&mut f32, f32) + Sync) {
+        let Some(modulation) = self.modulation else {
             return;
         };
         let pixels = self.pixels();
@@ -178,9 +174,9 @@ impl<'a> LayerTile<'a> {
             let Some(color) = layer.color() else {
                 return;
             };
-            let factors = &factors[color * pixels..(color + 1) * pixels];
+            let factors = &modulation[color * pixels..(color + 1) * pixels];
             for (value, factor) in plane.iter_mut().zip(factors) {
-                change(value, *factor);
+                change(value, factor.powf(self.gamma));
             }
         });
     }

@@ -1,15 +1,15 @@
 //! Tests of layers with a narrow network on frames with a pattern.
 
 use demc_data::Frame;
+use demc_data::Transfer;
 use demc_data::image::frame::TEXTURES;
-use demc_model::{Head, Ops, Variant};
+use demc_model::{Ops, Variant, Weights};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
-use super::layers::LayerTile;
 use super::*;
-use crate::bundle::testing::{bundle, bundle_with_kernels, filtered, frame, kernel_bundle};
+use crate::bundle::testing::{bundle, filtered, frame, kernel_bundle};
 
 /// Share of the largest value, as documented.
 const TOLERANCE: f32 = 1e-4;
@@ -20,6 +20,31 @@ fn model() -> Bundle {
     bundle.meta.normalizer.albedo_demodulation_epsilon = Some(0.07);
     bundle.meta.normalizer.restore_light = true;
     bundle.albedo_filter = filtered(Variant::Demc, Variant::DemcNosn).albedo_filter;
+    bundle
+}
+
+/// A model without kernels that demodulates, filters albedo, and restores light.
+fn plain_model() -> Bundle {
+    let mut bundle = model();
+    let plain = self::bundle(Variant::Demc);
+    (bundle.model, bundle.meta.model) = (plain.model, plain.meta.model);
+    bundle
+}
+
+/// A U-Net with a second encoder, whose image is not black.
+fn unet() -> Bundle {
+    let mut bundle = bundle(Variant::UnetNosn);
+    bundle.meta.normalizer.transfer = Transfer::Pu;
+    bundle.meta.normalizer.exposure_level = Some(0.18);
+    let mut weights = bundle.model.weights();
+    for weight in &mut weights {
+        if weight.name.starts_with("head.") {
+            let positive = |value: &mut f32| *value = 0.1 * value.abs() + 1e-3;
+            weight.data.iter_mut().for_each(positive);
+        }
+    }
+    let loaded = (bundle.meta.model).load(&mut Weights::new(weights), &bundle.device());
+    bundle.model = loaded.expect("its own weights");
     bundle
 }
 
@@ -71,10 +96,76 @@ fn layers_that_add_up_to_the_colour_still_do() {
 }
 
 #[test]
-fn layers_of_a_mixed_head_add_up_to_its_image() {
-    for variant in [Variant::Unet, Variant::UnetDemc] {
-        check_sums(|| bundle_with_kernels(variant, Head::Mixed));
+fn layers_of_a_network_without_kernels_add_up_to_its_image() {
+    check_sums(plain_model);
+    check_sums(unet);
+}
+
+/// Layers that do not add up to the colour are what the network makes of them as an image.
+#[test]
+fn layers_of_a_network_without_kernels_are_images_of_their_own() {
+    for model in [plain_model(), unet()] {
+        let (frame, layers) = passes(50, 70);
+        let alone = |color: Vec<f32>, model: &Bundle| {
+            let mut frame = frame.clone();
+            frame.color = color;
+            let options = DenoiseOptions {
+                ensemble: Ensemble::Four,
+                ..DenoiseOptions::default()
+            };
+            let denoised = model.denoise_with(&frame, &options, unobserved);
+            denoised.expect("denoised").color_hdr
+        };
+        // A grey layer, then blue, green, and red.
+        let chosen: Vec<Layer> = layers[..4].iter().rev().cloned().collect();
+        let samples = |layer: &Layer| layer.samples.clone();
+        let color: Vec<f32> = layers[..3].iter().flat_map(samples).collect();
+        let options = DenoiseOptions {
+            ensemble: Ensemble::Four,
+            layers: chosen.clone(),
+            ..DenoiseOptions::default()
+        };
+        let found = model.denoise_with(&frame, &options, unobserved);
+        let found = found.expect("denoised");
+        assert_eq!(found.color_hdr, alone(frame.color.clone(), &model));
+        let found: Vec<&[f32]> = found.layers.chunks_exact(50 * 70).collect();
+        let expected = alone(color, &model);
+        for (index, expected) in expected.chunks_exact(50 * 70).enumerate() {
+            assert_eq!(found[3 - index], expected, "{index}");
+        }
+        let mut plain = model;
+        plain.meta.normalizer.albedo_demodulation_epsilon = None;
+        let grey = alone(chosen[0].samples.repeat(3), &plain);
+        let planes: Vec<&[f32]> = grey.chunks_exact(50 * 70).collect();
+        let means = (0..50 * 70).map(|i| planes.iter().map(|plane| plane[i]).sum::<f32>() / 3.0);
+        let means: Vec<f32> = means.collect();
+        assert_eq!(found[0], means);
     }
+}
+
+#[test]
+fn the_share_grows_once_over_the_passes_of_all_layers() {
+    let mut bundle = plain_model();
+    bundle.albedo_filter = None;
+    let (frame, layers) = passes(490, 70);
+    let options = DenoiseOptions {
+        tiling: Tiling {
+            side: Some(224),
+            ..Tiling::default()
+        },
+        layers,
+        ..DenoiseOptions::default()
+    };
+    let mut shares = Vec::new();
+    let denoised = bundle.denoise_with(&frame, &options, |progress| {
+        shares.push(progress.share);
+        ControlFlow::Continue(())
+    });
+    assert!(denoised.expect("denoised").tiles.count() > 1);
+    assert!(shares.is_sorted() && shares[0] == 0.0, "{shares:?}");
+    assert!(shares[shares.len() - 1] > 0.99, "{shares:?}");
+    let steps = shares.windows(2).map(|pair| pair[1] - pair[0]);
+    assert!(steps.fold(0.0, f64::max) < 0.2, "{shares:?}");
 }
 
 /// Whole and in tiles, of sizes with padding, with the kernels and with Burn's operations.
@@ -190,33 +281,19 @@ fn layers_that_cannot_be_filtered_are_refused() {
             other => panic!("{other:?}"),
         }
     };
-    let found = Head::Grey;
     assert_eq!(
-        refuse(&bundle(Variant::Demc), 64, Ensemble::One),
-        LayersError::Head { found }
+        refuse(&bundle(Variant::Kpcn), 64, Ensemble::One),
+        LayersError::Kpcn
     );
     assert_eq!(
         refuse(&model(), 64, Ensemble::Four),
         LayersError::Ensemble { count: 4 }
     );
-    let error = refuse(&model(), 63, Ensemble::One);
-    assert_eq!(
-        error.to_string(),
-        "layer lamp.R holds 63 values; the image has 64 pixels"
-    );
-}
-
-#[test]
-fn a_tiny_filtered_colour_leaves_the_layers_finite() {
-    let layers = [Layer {
-        name: "key.R".into(),
-        samples: vec![0.0; 2],
-    }];
-    let color = [0.0; 6];
-    let tile = LayerTile::new(&layers, Some(&color), None, 2.2, [&(0..1), &(0..2)]);
-    // The layer, and the filtered colour: f32::MIN_POSITIVE / 4, then 0.5.
-    let tiny = f32::MIN_POSITIVE / 4.0;
-    let filtered = vec![0.0, 0.25, tiny, 0.5, 0.0, 0.0, 0.0, 0.0];
-    let found = tile.output(filtered, &[100.0, 1.0, 0.0, 0.0, 0.0, 0.0]);
-    assert_eq!(found, [0.0, 0.5]);
+    for model in [model(), bundle(Variant::Demc)] {
+        let error = refuse(&model, 63, Ensemble::One);
+        assert_eq!(
+            error.to_string(),
+            "layer lamp.R holds 63 values; the image has 64 pixels"
+        );
+    }
 }

@@ -7,6 +7,7 @@ mod filter_tests;
 mod input;
 #[cfg(test)]
 mod kpcn_tests;
+mod layer_images;
 mod layers;
 #[cfg(test)]
 mod layers_tests;
@@ -30,7 +31,9 @@ use crate::padding::Padding;
 use crate::tiles::{Tiles, Tiling};
 use crate::{Bundle, memory};
 use input::FrameInput;
+use layer_images::LayerImages;
 use layers::check_layer_sizes;
+use progress::of_pass;
 
 pub use crate::error::{DenoiseError, LayersError};
 pub use demc_data::input::transform::MAX_INPUT_SCALE;
@@ -58,8 +61,8 @@ pub struct DenoiseOptions {
     pub input_scale: Option<f32>,
     /// Whether the output gets the light of the noisy image. `None`: as the model says.
     pub restore_light: Option<bool>,
-    /// Further channels to filter with the colour's kernels. They need a kernel or mixed
-    /// head, and [`Ensemble::One`].
+    /// Further channels to denoise; see [`Bundle::check_layers`]. Those of a network without kernels
+    /// have their own exposures.
     pub layers: Vec<Layer>,
 }
 
@@ -70,7 +73,8 @@ pub struct Denoised {
     pub color_hdr: Vec<f32>,
     /// The denoised alpha `[H, W]`, for a frame whose alpha varies.
     pub alpha: Option<Vec<f32>>,
-    /// The filtered layers `[layers, H, W]`, in the order of the options. Of either sign.
+    /// The denoised layers `[layers, H, W]`, in the order of the options. Of either sign with a kernel
+    /// head.
     pub layers: Vec<f32>,
     /// The tiles that the image was cut into.
     pub tiles: Tiles,
@@ -150,26 +154,35 @@ impl Bundle {
                 source,
             })?;
         input.filter_albedo(tiling, observer)?;
-        input.layers = layers;
-        let mut color_hdr = input.denoise(&tiles, observer)?;
+        let restores_light = restore_light.unwrap_or(self.meta.normalizer.restore_light);
+        let (filtered, own): (&[Layer], &[Layer]) = if self.filters_layers() {
+            (layers, &[])
+        } else {
+            (&[], layers)
+        };
+        let images = LayerImages::new(own);
+        input.layers = filtered;
+        let mut color_hdr = input.denoise(&tiles, &mut of_pass(observer, [0, images.passes()]))?;
         let mut layer_planes = color_hdr.split_off(COLOR_CHANNELS * pixels);
         input.layers = &[];
+        layer_planes.extend(images.denoise(&input, &tiles, restores_light, observer)?);
         let alpha = input.denoise_alpha(&tiles, observer)?;
         let seam_error = if tiling.is_exact() {
             None
         } else {
             input.seam_error(&tiles, &color_hdr, observer)?
         };
-        if restore_light.unwrap_or(self.meta.normalizer.restore_light) {
+        if restores_light {
             let factors = light::factors(&frame.color, &color_hdr, frame.height, frame.width);
             light::multiply(&mut color_hdr, &factors);
-            let colors = layers.iter().map(Layer::color);
+            let colors = filtered.iter().map(Layer::color);
             for (plane, color) in layer_planes.chunks_mut(pixels).zip(colors) {
                 if let Some(color) = color {
                     light::multiply(plane, &factors[color * pixels..(color + 1) * pixels]);
                 }
             }
         }
+        images.scale(&mut layer_planes, &frame.color, &color_hdr);
         Ok(Denoised {
             color_hdr,
             alpha,
@@ -259,8 +272,7 @@ impl Bundle {
     ) -> Result<Tiles, memory::TooLarge> {
         let padded = (size.padded_height(), size.padded_width());
         let budget = tiling.memory.or_else(|| {
-            // The layers of all tiles, and again as a plane each.
-            let planes = outputs + 2 * layers;
+            let planes = outputs + self.layer_planes(layers);
             let output = (planes * size.height * size.width * size_of::<f32>()) as u64;
             Some(self.memory_budget()?.saturating_sub(output))
         });
@@ -273,7 +285,7 @@ impl Bundle {
         let colors = self.meta.model.variant.spec().color_channels;
         let extra = (planes * size_of::<f32>()) as u64
             + ensemble.bytes_per_pixel(colors + FEATURES, colors);
-        let images = self.layer_images(layers);
+        let images = self.filtered_images(layers);
         let need = |height, width| {
             self.pass_bytes_with(images, height, width) + extra * (height * width) as u64
         };

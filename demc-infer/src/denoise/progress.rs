@@ -10,8 +10,8 @@ pub struct DenoiseProgress {
     pub tile: usize,
     /// Number of tiles.
     pub tiles: usize,
-    /// Finished share of the image, from 0 to 1. It stays at 0 in the pass of an albedo filter and
-    /// at 1 in that of alpha.
+    /// Finished share of the image and its layers, from 0 to 1. It stays at 0 in the pass of an albedo
+    /// filter and at 1 in that of alpha.
     pub share: f64,
 }
 
@@ -22,4 +22,15 @@ pub type DenoiseObserver<'a> = dyn FnMut(DenoiseProgress) -> ControlFlow<()> + '
 /// Lets the work finish.
 pub fn unobserved(_: DenoiseProgress) -> ControlFlow<()> {
     ControlFlow::Continue(())
+}
+
+/// The observer of the pass `pass` of `passes`, whose shares add up to 1.
+pub(super) fn of_pass(
+    observer: &mut DenoiseObserver,
+    [pass, passes]: [usize; 2],
+) -> impl FnMut(DenoiseProgress) -> ControlFlow<()> {
+    move |progress| {
+        let share = (pass as f64 + progress.share) / passes as f64;
+        observer(DenoiseProgress { share, ..progress })
+    }
 }

@@ -43,7 +43,7 @@ impl GraphBuilder {
 
     /// An image in linear light, filtered with predicted kernels. `decoded` are the decoder's maps, deepest
     /// first.
-    pub(super) fn filtered_on_all_scales(
+    fn filtered_on_all_scales(
         &mut self,
         kernels: &[Conv2d],
         decoded: &[Value],

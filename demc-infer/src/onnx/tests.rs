@@ -8,7 +8,7 @@ use rand_chacha::rand_core::SeedableRng;
 
 use super::proto::{FLOAT16, GraphProto, NodeProto};
 use super::*;
-use crate::bundle::testing::{bundle, bundle_with, filtered};
+use crate::bundle::testing::{bundle, filtered};
 
 fn graph(variant: Variant, precision: Precision) -> GraphProto {
     graph_of(&bundle(variant), precision)
@@ -45,9 +45,6 @@ fn every_value_is_defined_once_and_before_its_use() {
                 let filtered = filtered(variant, Variant::Demc);
                 graphs.push(graph_of(&filtered, precision));
                 graphs.push(graph_of(&with_kernels(&filtered), precision));
-            }
-            if variant.is_unet() {
-                graphs.push(graph_of(&bundle_with(variant, Head::Mixed), precision));
             }
             for graph in graphs {
                 let mut known: HashSet<&str> =

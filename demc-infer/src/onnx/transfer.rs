@@ -6,9 +6,6 @@ use demc_kernels::pu::{self, A, B, C, D, E, F, G, PEAK, X0, X1, Y0, Y1};
 use super::graph::{GraphBuilder, Value};
 use super::network::{COLOR, OUTPUT};
 
-/// Name of the radiance of at least 0 that [`GraphBuilder::compressed`] begins with.
-pub(super) const POSITIVE_COLOR: &str = "color_positive";
-
 impl GraphBuilder {
     /// The network's colour: radiance of at least 0, compressed, divided by the modulation.
     pub(super) fn compressed(
@@ -16,13 +13,13 @@ impl GraphBuilder {
         normalizer: &Normalizer,
         modulation: Option<&Value>,
     ) -> Value {
-        let positive = self.node("Relu", POSITIVE_COLOR, &[&Value(COLOR.into())], &[]);
+        let positive = self.node("Relu", "color_positive", &[&Value(COLOR.into())], &[]);
         let color = match normalizer.transfer {
             Transfer::Gamma => {
                 let exponent = self.constant("inverse_gamma", &[], &[1.0 / normalizer.gamma]);
                 self.node("Pow", "color_gamma", &[&positive, &exponent], &[])
             }
-            Transfer::Pu => self.pu("pu", &positive),
+            Transfer::Pu => self.pu(&positive),
         };
         match modulation {
             Some(modulation) => self.node("Div", "color_demodulated", &[&color, modulation], &[]),
@@ -47,23 +44,22 @@ impl GraphBuilder {
         self.node(op, name, &[x, &constant], &[])
     }
 
-    /// See [`pu::value`]. Names of values begin with `part`.
-    pub(super) fn pu(&mut self, part: &str, y: &Value) -> Value {
-        let name = |what: &str| format!("{part}.{what}");
-        let dark = self.with("Mul", &name("dark"), y, A);
-        let power = self.with("Pow", &name("power"), y, C);
-        let scaled = self.with("Mul", &name("scaled"), &power, B);
-        let middle = self.with("Add", &name("middle"), &scaled, D);
-        let shifted = self.with("Add", &name("shifted"), y, F);
-        let logarithm = self.node("Log", &name("logarithm"), &[&shifted], &[]);
-        let steep = self.with("Mul", &name("steep"), &logarithm, E);
-        let bright = self.with("Add", &name("bright"), &steep, G);
-        let is_dark = self.with("LessOrEqual", &name("is_dark"), y, Y0);
-        let is_middle = self.with("LessOrEqual", &name("is_middle"), y, Y1);
+    /// See [`pu::value`].
+    fn pu(&mut self, y: &Value) -> Value {
+        let dark = self.with("Mul", "pu.dark", y, A);
+        let power = self.with("Pow", "pu.power", y, C);
+        let scaled = self.with("Mul", "pu.scaled", &power, B);
+        let middle = self.with("Add", "pu.middle", &scaled, D);
+        let shifted = self.with("Add", "pu.shifted", y, F);
+        let logarithm = self.node("Log", "pu.logarithm", &[&shifted], &[]);
+        let steep = self.with("Mul", "pu.steep", &logarithm, E);
+        let bright = self.with("Add", "pu.bright", &steep, G);
+        let is_dark = self.with("LessOrEqual", "pu.is_dark", y, Y0);
+        let is_middle = self.with("LessOrEqual", "pu.is_middle", y, Y1);
         let upper = [&is_middle, &middle, &bright];
-        let upper = self.node("Where", &name("upper"), &upper, &[]);
-        let value = self.node("Where", &name("value"), &[&is_dark, &dark, &upper], &[]);
-        self.with("Div", &name("color"), &value, pu::value(PEAK))
+        let upper = self.node("Where", "pu.upper", &upper, &[]);
+        let value = self.node("Where", "pu.value", &[&is_dark, &dark, &upper], &[]);
+        self.with("Div", "pu.color", &value, pu::value(PEAK))
     }
 
     /// See [`pu::inverse`].

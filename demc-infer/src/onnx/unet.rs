@@ -3,12 +3,10 @@
 use demc_data::Normalizer;
 use demc_model::config::COLOR_CHANNELS;
 use demc_model::layers::ConvStack;
-use demc_model::mixed_head::MixedHead;
 use demc_model::side_encoder::SideEncoder;
 use demc_model::unet::Unet;
 
 use super::graph::{AttributeValue, GraphBuilder, Value};
-use super::transfer::POSITIVE_COLOR;
 
 impl GraphBuilder {
     pub(super) fn unet(&mut self, network: &Unet, normalizer: &Normalizer) {
@@ -36,7 +34,6 @@ impl GraphBuilder {
             x = self.pooled(&y);
         }
         x = self.unet_level(&x, &network.bottom);
-        let mut decoded = Vec::new();
         for (index, level) in network.decoder.iter().enumerate() {
             let skip = skips.pop().expect("a skip for each level");
             let both = self.doubled_with(&x, &skip);
@@ -47,13 +44,9 @@ impl GraphBuilder {
                 let fused = self.conv(&both, &side.fuses[index], None);
                 x = self.relu(&fused);
             }
-            decoded.push(x.clone());
         }
         let y = self.conv(&x, &network.head, None);
-        let mut out = self.relu(&y);
-        if let Some(head) = &network.mixed {
-            out = self.mixed(head, &out, &decoded);
-        }
+        let out = self.relu(&y);
         self.expanded(normalizer, &out);
     }
 
@@ -72,20 +65,6 @@ impl GraphBuilder {
             maps.push(x.clone());
         }
         maps
-    }
-
-    /// The U-Net's image blended with the filtered one (`demc_model::mixed_head`).
-    fn mixed(&mut self, head: &MixedHead, direct: &Value, decoded: &[Value]) -> Value {
-        let noisy = Value(POSITIVE_COLOR.into());
-        let filtered = self.filtered_on_all_scales(&head.kernels, decoded, noisy);
-        let filtered = self.node("Relu", "mixed.positive", &[&filtered], &[]);
-        let filtered = self.pu("mixed", &filtered);
-        let last = decoded.last().expect("a decoder has levels");
-        let logit = self.conv(last, &head.gate, None);
-        let gate = self.node("Sigmoid", "mixed.share", &[&logit], &[]);
-        let difference = self.node("Sub", "mixed.difference", &[&filtered, direct], &[]);
-        let change = self.node("Mul", "mixed.change", &[&difference, &gate], &[]);
-        self.node("Add", "mixed.out", &[direct, &change], &[])
     }
 
     fn unet_level(&mut self, x: &Value, level: &ConvStack) -> Value {

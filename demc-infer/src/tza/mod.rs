@@ -310,8 +310,7 @@ fn normalizer() -> Normalizer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bundle::testing::{bundle, bundle_with, filtered};
-    use demc_model::Head;
+    use crate::bundle::testing::{bundle, filtered};
 
     fn unet() -> Bundle {
         let mut unet = bundle(Variant::Unet);
@@ -342,8 +341,8 @@ mod tests {
         let error = |bundle: &Bundle| bundle.export_tza(&path).expect_err("refused");
         let other = error(&bundle(Variant::Semc));
         assert!(matches!(other, OidnError::NotUnet { .. }), "{other}");
-        let mixed = error(&bundle_with(Variant::Unet, Head::Mixed));
-        assert!(matches!(mixed, OidnError::NotUnet { .. }), "{mixed}");
+        let grown = error(&bundle(Variant::UnetDemc));
+        assert!(matches!(grown, OidnError::NotUnet { .. }), "{grown}");
         let gamma = error(&bundle(Variant::Unet));
         assert!(matches!(gamma, OidnError::NotUnet { .. }), "{gamma}");
         let mut filter = filtered(Variant::Unet, Variant::Demc);

@@ -99,7 +99,7 @@ impl Deviation {
             }),
             of_value: worst(&|f, e| (f - e).abs() / (e * e + RELMSE_EPSILON).sqrt()),
             limit_of_value: match head {
-                Head::Kernel | Head::Mixed => KERNEL_TOLERANCE,
+                Head::Kernel => KERNEL_TOLERANCE,
                 Head::Grey | Head::Xavier => TOLERANCE,
             },
         }

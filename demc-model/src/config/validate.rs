@@ -41,7 +41,7 @@ impl ModelConfig {
             ..used
         };
         let heads: &[Head] = if self.variant.is_unet() {
-            &[Head::Grey, Head::Mixed]
+            &[Head::Grey]
         } else {
             &[Head::Grey, Head::Xavier, Head::Kernel]
         };

@@ -37,7 +37,7 @@ pub fn pass_bytes(
     match config.variant {
         Variant::Kpcn => return kpcn_bytes(config, height * width),
         variant if variant.is_unet() && ops.has_fast_inference() => {
-            return unet_bytes(config, height, width, layers);
+            return unet_bytes(config, height, width);
         }
         variant if variant.is_unet() => {
             let [.., [_, below], _] = config.size.spec().decoder;
@@ -322,7 +322,7 @@ impl PeakEstimate<'_> {
                 let values: usize = levels.map(|pixels| pixels * COLOR_CHANNELS).sum();
                 values * self.filtered_images()
             }
-            Head::Grey | Head::Xavier | Head::Mixed => 0,
+            Head::Grey | Head::Xavier => 0,
         }
     }
 

@@ -32,13 +32,12 @@ pub(super) struct KernelHead {
     out: Option<FeatureMaps>,
 }
 
-/// Images in linear light: planes in the network's space, which `linearize` leaves, and the layers
-/// `[layers, 3, H, W]` of a single image.
+/// Images in linear light: planes in gamma space, and the layers `[layers, 3, H, W]` of a single image.
 pub(super) fn linear_images(
+    isa: Isa,
     grid: Grid,
     color: &FlexTensor,
     layers: Option<Tensor<4>>,
-    linearize: impl FnOnce(&mut [f32]),
 ) -> FeatureMaps {
     let count = layers.as_ref().map_or(0, |layers| layers.dims()[0]);
     let all = Grid {
@@ -48,7 +47,7 @@ pub(super) fn linear_images(
     let mut images = FeatureMaps::new(all, COLOR_CHANNELS);
     let (colors, others) = images.values.split_at_mut(grid.pixels() * COLOR_CHANNELS);
     grid::nhwc_from_nchw(grid, color.storage::<f32>(), colors);
-    linearize(colors);
+    power::positive_powers(isa, colors, GAMMA);
     if let Some(layers) = layers.map(host) {
         let grid = Grid {
             batch: count,
@@ -151,15 +150,10 @@ impl KernelHead {
         });
     }
 
-    /// The filtered images in linear light.
-    pub(super) fn into_images(self) -> FeatureMaps {
-        self.out.expect("all levels are filtered")
-    }
-
     /// The output in gamma space and the layers in linear light, planar.
     pub(super) fn finish(self) -> (Vec<f32>, Option<Vec<f32>>) {
         let (isa, layers) = (self.isa, self.layers);
-        let mut out = self.into_images();
+        let mut out = self.out.expect("all levels are filtered");
         let batch = out.grid.batch - layers;
         let (colors, others) = {
             let image = out.grid.height * out.grid.width * COLOR_CHANNELS;
@@ -177,7 +171,7 @@ impl KernelHead {
 }
 
 /// The planes of images on `grid`, whatever their number.
-pub(super) fn planar(grid: Grid, values: &[f32]) -> Vec<f32> {
+fn planar(grid: Grid, values: &[f32]) -> Vec<f32> {
     let batch = values.len() / (grid.height * grid.width * COLOR_CHANNELS);
     let mut planar = memory::buffer(values.len());
     grid::nchw_from_nhwc(Grid { batch, ..grid }, values, &mut planar);

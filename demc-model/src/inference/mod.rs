@@ -23,7 +23,6 @@ mod folded;
 mod full_resolution;
 mod images;
 mod kernel_head;
-mod mixed_head;
 mod pass;
 mod side_encoder;
 #[cfg(test)]
@@ -38,12 +37,11 @@ use burn::backend::flex::FlexTensor;
 use burn::nn::conv::Conv2d;
 use burn::tensor::{Tensor, TensorData};
 use demc_kernels::conv3x3::Tile;
-use demc_kernels::{Isa, grid, memory, power};
+use demc_kernels::{Isa, grid, memory};
 
 use crate::config::{COLOR_CHANNELS, LEVELS};
 use crate::decoder::Decoder;
 use crate::dual_encoder::DualEncoder;
-use crate::kernel_head::GAMMA;
 use encoder::{DEEPEST_BANDED, folded_block};
 use feature_maps::FeatureMaps;
 use full_resolution::{SkipSources, UPPER_LEVELS};
@@ -90,9 +88,7 @@ fn forward_with(
     let color = model.decoder.head.is_none().then(|| images.color());
     let encoded = pass.encode(images)?;
     let head = color.map(|color| {
-        let images = linear_images(grid, &color, layers, |colors| {
-            power::positive_powers(pass.isa, colors, GAMMA);
-        });
+        let images = linear_images(pass.isa, grid, &color, layers);
         let layers = images.grid.batch - batch;
         KernelHead::new(pass.isa, &model.decoder.kernels, images, layers)
     });

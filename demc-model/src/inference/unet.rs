@@ -13,7 +13,6 @@ use super::feature_maps::FeatureMaps;
 use super::folded::FoldedConv;
 use super::full_resolution::write_rows;
 use super::images_of;
-use super::mixed_head::MixedPass;
 use super::pass::BandPlan;
 use super::side_encoder::SideMaps;
 use super::unet_pass::{ImagePlanes, UnetPass, folded, interleave};
@@ -24,10 +23,10 @@ use crate::unet::{UNET_LEVELS, Unet};
 /// As [`Unet::forward`], on the host without autodiff.
 pub(crate) fn forward(
     network: &Unet,
-    [color, features]: [Tensor<4>; 2],
-    layers: Option<Tensor<4>>,
+    color: Tensor<4>,
+    features: Tensor<4>,
     observer: &mut Observer,
-) -> Result<(Tensor<4>, Option<Tensor<4>>), Cancelled> {
+) -> Result<Tensor<4>, Cancelled> {
     let [_, _, height, width] = color.dims();
     let input = Input::new(network, color, features);
     let decoder_and_encoders = 2 + usize::from(network.side.is_some());
@@ -36,9 +35,7 @@ pub(crate) fn forward(
         tile: Tile::F4,
         watch: &Watch::new(input.color.grid, decoder_and_encoders, observer),
     };
-    let (out, layers) = pass.forward(network, &input, layers)?;
-    let layers = layers.map(|layers| images_of(layers, height, width));
-    Ok((images_of(out, height, width), layers))
+    Ok(images_of(pass.forward(network, &input)?, height, width))
 }
 
 /// Colour and features.
@@ -83,13 +80,8 @@ impl Input {
 }
 
 impl UnetPass<'_> {
-    /// Returns the planes of the images, and of the layers that a mixed head filters.
-    fn forward(
-        &self,
-        network: &Unet,
-        input: &Input,
-        layers: Option<Tensor<4>>,
-    ) -> Result<(Vec<f32>, Option<Vec<f32>>), Cancelled> {
+    /// Returns the planes of the images.
+    fn forward(&self, network: &Unet, input: &Input) -> Result<Vec<f32>, Cancelled> {
         let grid = input.color.grid;
         let side = network.side.as_ref();
         let mut side = side
@@ -97,9 +89,6 @@ impl UnetPass<'_> {
             .transpose()?;
         // The input of each encoder level but the first, which is the skip of the decoder's.
         let mut skips: Vec<FeatureMaps> = Vec::with_capacity(UNET_LEVELS);
-        let mixed = network.mixed.as_ref();
-        let mut mixed = mixed
-            .map(|head| MixedPass::new(Isa::current(), head, grid, &input.color.planes, layers));
         for (level, module) in network.encoder.iter().enumerate() {
             let grid = (0..level).fold(grid, |grid, _| grid.halved());
             let convs = folded(module);
@@ -157,9 +146,6 @@ impl UnetPass<'_> {
             if let Some(side) = &mut side {
                 side.free(level);
             }
-            if let Some(mixed) = &mut mixed {
-                mixed.filter_level(level, &x, self.plan.band);
-            }
         }
         let mut convs = folded(last);
         let head = convs.len();
@@ -178,18 +164,14 @@ impl UnetPass<'_> {
                 if conv == head {
                     let planar = &mut planar[image * image_values..][..image_values];
                     write_rows(planar, grid, rows, values);
-                } else if conv + 1 == head {
-                    if let Some(side) = &side {
-                        side.fuse(0, image, rows.clone(), values);
-                    }
-                    if let Some(mixed) = &mut mixed {
-                        mixed.filter_rows(image, rows, values);
-                    }
+                } else if conv + 1 == head
+                    && let Some(side) = &side
+                {
+                    side.fuse(0, image, rows, values);
                 }
             },
         )?;
-        let layers = mixed.and_then(|mixed| mixed.blend(&mut planar));
-        Ok((planar, layers))
+        Ok(planar)
     }
 
     /// A level's whole output, whose rows `complete` may change.

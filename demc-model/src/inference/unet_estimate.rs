@@ -1,7 +1,7 @@
 //! Memory of a pass of a U-Net.
 
 use super::pass::{BandPlan, TILE_VALUES, VALUE, WAITING_ROWS};
-use crate::config::{COLOR_CHANNELS, DETAIL_CHANNELS, FEATURE_CHANNELS, Head, Input, ModelConfig};
+use crate::config::{COLOR_CHANNELS, DETAIL_CHANNELS, FEATURE_CHANNELS, Input, ModelConfig};
 use crate::side_encoder::LEVEL_WIDTHS;
 use crate::unet::{UNET_LEVELS, UnetSpec};
 
@@ -9,7 +9,7 @@ use crate::unet::{UNET_LEVELS, UnetSpec};
 ///
 /// Each level is a phase. It holds the images, and the maps that it reads, writes, and keeps for later levels.
 /// A band of its convolutions and their prepared weights come on top.
-pub(super) fn unet_bytes(config: &ModelConfig, height: usize, width: usize, layers: usize) -> u64 {
+pub(super) fn unet_bytes(config: &ModelConfig, height: usize, width: usize) -> u64 {
     let estimate = UnetEstimate {
         spec: config.size.spec(),
         inputs: config.guides.channels(),
@@ -19,13 +19,7 @@ pub(super) fn unet_bytes(config: &ModelConfig, height: usize, width: usize, laye
         width,
     };
     let images = estimate.map(0, COLOR_CHANNELS + FEATURE_CHANNELS);
-    let head = match config.head {
-        // The noisy, the filtered, and the blended images of all scales, and the gate; the layers beside the
-        // colour, and their planes.
-        Head::Mixed => estimate.map(0, (4 + 5 * layers) * COLOR_CHANNELS + 1),
-        Head::Grey | Head::Xavier | Head::Kernel => 0,
-    };
-    ((images + head + estimate.largest_phase()) * VALUE) as u64
+    ((images + estimate.largest_phase()) * VALUE) as u64
 }
 
 /// Channels of the encoder beside the U-Net.

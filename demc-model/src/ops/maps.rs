@@ -3,12 +3,11 @@
 use burn::module::RunningState;
 use burn::nn::BatchNorm;
 use burn::nn::conv::{Conv2d, ConvTranspose2d};
-use burn::tensor::{Tensor, activation, module::max_pool2d, ops::MaxPoolOptions};
+use burn::tensor::{Tensor, module::max_pool2d, ops::MaxPoolOptions};
 
 use super::activation::Activation;
 use super::choice::Ops;
 use super::{filter, kernels};
-use crate::pu;
 
 /// A batch of feature maps, `[B, C, H, W]` in the paper's terms.
 ///
@@ -151,33 +150,6 @@ impl Maps {
         let visible = self.tensor.clone().detach().greater_elem(darkest).float();
         let powers = self.tensor.clamp_min(darkest).powf_scalar(1.0 / gamma);
         let tensor = powers * visible;
-        Maps { tensor, ..self }
-    }
-
-    /// Network colours of Open Image Denoise's curve in linear light. Without a gradient.
-    pub fn pu_radiance(self) -> Self {
-        let tensor = pu::radiance(self.tensor.detach());
-        Maps { tensor, ..self }
-    }
-
-    /// Linear light as network colours of Open Image Denoise's curve.
-    pub fn pu_color(self) -> Self {
-        let tensor = pu::color(self.tensor);
-        Maps { tensor, ..self }
-    }
-
-    /// `1 / (1 + e^-x)`.
-    pub fn sigmoid(self) -> Self {
-        let tensor = activation::sigmoid(self.tensor);
-        Maps { tensor, ..self }
-    }
-
-    /// `(1 - share) self + share other`.
-    ///
-    /// # Shapes
-    /// Twice `[B, C, H, W]` and `[B, 1, H, W]` to `[B, C, H, W]`.
-    pub fn mix(self, other: Maps, share: Maps) -> Self {
-        let tensor = self.tensor.clone() + (other.tensor - self.tensor) * share.tensor;
         Maps { tensor, ..self }
     }
 

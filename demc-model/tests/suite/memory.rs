@@ -29,23 +29,12 @@ fn the_estimate_agrees_with_the_allocations() {
 }
 
 #[test]
-fn the_estimate_of_a_mixed_head_agrees_with_the_allocations() {
-    let name = "memory::the_estimate_of_a_mixed_head_agrees_with_the_allocations";
-    alone_with_mixed_head(name, Variant::Unet);
-}
-
-#[test]
 fn the_estimate_of_a_second_encoder_agrees_with_the_allocations() {
     let name = "memory::the_estimate_of_a_second_encoder_agrees_with_the_allocations";
-    alone_with_mixed_head(name, Variant::UnetDemc);
-}
-
-fn alone_with_mixed_head(name: &str, variant: Variant) {
     let threads = rayon::ThreadPoolBuilder::new().num_threads(2).build();
     let config = ModelConfig {
-        variant,
+        variant: Variant::UnetDemc,
         width: 16,
-        head: Head::Mixed,
         ..ModelConfig::default()
     };
     run_alone(name, || {

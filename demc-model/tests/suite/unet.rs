@@ -1,9 +1,8 @@
 //! The U-Net: its inference against its modules, and what its guides do.
 
 use burn::tensor::{Device, Tensor};
-use demc_model::mixed_head::GATE_BIAS;
 use demc_model::unet::{Guides, UnetSize};
-use demc_model::{Denoiser, Head, ModelConfig, Ops, Variant, Weights};
+use demc_model::{Denoiser, ModelConfig, Ops, Variant, Weights};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -21,12 +20,11 @@ fn network(config: ModelConfig) -> Denoiser {
     config.init(&mut rng, [0.0; 3], &Device::flex())
 }
 
-/// The networks that start as a U-Net: a mixed head, and second encoders beside it.
-fn grown() -> [ModelConfig; 3] {
-    [Variant::Unet, Variant::UnetNosn, Variant::UnetDemc].map(|variant| ModelConfig {
+/// The networks that start as a U-Net: second encoders beside it.
+fn grown() -> [ModelConfig; 2] {
+    [Variant::UnetNosn, Variant::UnetDemc].map(|variant| ModelConfig {
         variant,
         width: 8,
-        head: Head::Mixed,
         ..config(UnetSize::Small, Guides::AlbedoNormal)
     })
 }
@@ -84,12 +82,12 @@ fn moved(model: &Denoiser) -> Denoiser {
     loaded.expect("its own weights")
 }
 
-/// A second encoder adds nothing before the first step; a mixed head adds 12 % of a blurred image.
+/// A second encoder adds nothing before the first step.
 #[test]
 fn a_grown_network_starts_as_its_trunk() {
     let shape = [1, 32, 48];
     let (color, features) = (noise(3, shape), noise(12, shape));
-    let outputs = grown().map(|config| {
+    for config in grown() {
         let trunk = network(config.trunk().expect("a U-Net"));
         let whole = network(config);
         let mut weights = whole.weights();
@@ -101,21 +99,15 @@ fn a_grown_network_starts_as_its_trunk() {
         }
         let whole = config.load(&mut Weights::new(weights), &Device::flex());
         let whole = whole.expect("its own weights");
-        [whole, trunk].map(|model| {
+        let [whole, trunk] = [whole, trunk].map(|model| {
             values(
                 model
                     .with_ops(Ops::Burn)
                     .forward(color.clone(), features.clone()),
             )
-        })
-    });
-    let share = 1.0 / (1.0 + (-GATE_BIAS).exp());
-    for [whole, trunk] in &outputs {
-        assert_eq!(whole, &outputs[0][0], "second encoders differ");
-        let blurred = |whole: f32, trunk: f32| trunk + (whole - trunk) / share;
-        let range = whole.iter().zip(trunk).map(|(w, t)| blurred(*w, *t));
-        assert!(range.clone().all(|value| (-0.2..=2.2).contains(&value)));
-        assert!(range.fold(0.0, f32::max) > 0.1);
+        });
+        assert!(whole.iter().any(|value| *value > 0.1), "{config}: black");
+        assert_eq!(whole, trunk, "{config}");
     }
 }
 

@@ -205,9 +205,6 @@ impl Config {
         if self.model.head == Head::Kernel && !self.data.transfer.is_gamma() {
             problems.push("data.transfer: must be \"gamma\" for model.head = \"kernel\"".into());
         }
-        if self.model.head == Head::Mixed && self.data.transfer.is_gamma() {
-            problems.push("data.transfer: must be \"pu\" for model.head = \"mixed\"".into());
-        }
         if self.model.variant == Variant::Kpcn {
             problems.extend(self.kpcn_problems());
         } else if self.loss.separate != 0.0 {

@@ -43,8 +43,8 @@ pub struct OptimizerConfig {
     /// Share of every kernel that a step at learning rate 1 removes (decoupled weight decay,
     /// Loshchilov and Hutter 2019). Paper: none.
     pub weight_decay: f64,
-    /// Factor of the learning rate for the U-Net's own weights, beside those of a mixed head and of a
-    /// second encoder. Paper: none.
+    /// Factor of the learning rate for the U-Net's own weights, beside those of a second encoder.
+    /// Paper: none.
     pub trunk_rate: f64,
     /// Learning rate of the first step.
     pub lr_start: f64,

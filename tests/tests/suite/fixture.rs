@@ -81,7 +81,7 @@ pub fn config(variant: Variant, reading: Reading) -> ModelConfig {
 pub fn network_name(config: &ModelConfig) -> String {
     let end = match config.head {
         Head::Kernel => "-kernel",
-        Head::Grey | Head::Xavier | Head::Mixed => "",
+        Head::Grey | Head::Xavier => "",
     };
     let (variant, reading) = (config.variant.spec().name, config.reading.spec().name);
     format!("{variant}-{reading}{end}")

@@ -113,7 +113,7 @@ pub fn random_bundle(
     let device = Device::flex();
     let mut weights = config.init(rng, [0.5, 0.4, 0.3], &device).weights();
     let move_by = match config.head {
-        Head::Grey | Head::Xavier | Head::Mixed => move_by,
+        Head::Grey | Head::Xavier => move_by,
         // Positive changes make maps of 1e6. A softmax of such logits selects one pixel, and rounding
         // decides which. The output is never black, so no ReLU must be kept open.
         Head::Kernel => {
@@ -169,21 +169,15 @@ pub fn random_kpcn(rng: &mut ChaCha8Rng) -> Bundle {
 }
 
 /// The U-Net of Open Image Denoise, and those that grow from it, with random weights.
-pub fn random_unets(rng: &mut ChaCha8Rng) -> [Bundle; 4] {
-    let all = [
-        (Variant::Unet, Head::Grey),
-        (Variant::Unet, Head::Mixed),
-        (Variant::UnetNosn, Head::Grey),
-        (Variant::UnetDemc, Head::Mixed),
-    ];
-    all.map(|(variant, head)| random_unet(variant, head, rng))
+pub fn random_unets(rng: &mut ChaCha8Rng) -> [Bundle; 3] {
+    let all = [Variant::Unet, Variant::UnetNosn, Variant::UnetDemc];
+    all.map(|variant| random_unet(variant, rng))
 }
 
-fn random_unet(variant: Variant, head: Head, rng: &mut ChaCha8Rng) -> Bundle {
+fn random_unet(variant: Variant, rng: &mut ChaCha8Rng) -> Bundle {
     let random = random_bundle(Variant::DemcNosn, Reading::Released, 0.0..0.1, rng);
     let mut model = ModelConfig {
         variant,
-        head,
         size: UnetSize::Small,
         ..ModelConfig::default()
     };
@@ -193,8 +187,8 @@ fn random_unet(variant: Variant, head: Head, rng: &mut ChaCha8Rng) -> Bundle {
     let network = model.init(rng, [0.0; 3], &Device::flex());
     let mut weights = network.weights();
     for Weight { name, data, .. } in &mut weights {
-        // Gates, kernels, and fusions are not where they start.
-        if name.starts_with("mixed.") || name.starts_with("side.") {
+        // Fusions are not where they start.
+        if name.starts_with("side.") {
             data.iter_mut()
                 .for_each(|value| *value += rng.random_range(-0.1..0.1));
         }

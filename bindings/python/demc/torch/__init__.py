@@ -21,6 +21,7 @@ _MODULES = {
     "config": ["ModelConfig"],
     "exr": ["Frame", "read_exr"],
     "kpcn": ["Kpcn"],
+    "layers": [],
     "layouts": [],
     "light": [],
     "metrics": ["gamma_from_hdr", "hdr_from_gamma", "rel_mse"],

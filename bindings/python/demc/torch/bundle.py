@@ -24,9 +24,10 @@ from torch.nn import functional as F
 from . import light, preprocess, transfer
 from .config import KPCN, UNETS, ModelConfig
 from .kpcn import Kpcn
+from .layers import layer_color, layer_images, scaled
 from .metrics import gamma_from_hdr
 from .network import Denoiser
-from .preprocess import FEATURES, layer_color
+from .preprocess import FEATURES
 from .unet import Unet
 
 FORMAT = 1
@@ -89,8 +90,12 @@ class Bundle:
         Prepared colour [B, 3, H, W] and features [B, 12, H, W] (`preprocess.prepare`) -> [B, 3, H, W].
         Height and width are multiples of 32, or of 16 for variant `unet`. An albedo filter runs first.
         """
-        inputs, modulation = self._inputs(color, features)
-        return transfer.expand(self.model(*inputs) * modulation, self.meta["normalizer"])
+        return self._radiance(color, self.with_filtered_albedo(features))
+
+    @property
+    def filters_layers(self) -> bool:
+        """Whether the colour's kernels filter layers: whether the model has a kernel head."""
+        return self.model.config.head == "kernel"
 
     def radiance_with_layers(
         self, color: Tensor, features: Tensor, layers: Mapping[str, Tensor]
@@ -100,9 +105,9 @@ class Bundle:
         A layer whose name ends in R, G, or B is divided by that channel of the albedo as the colour
         is. Other layers, such as alpha, are not. Layers are neither scaled nor clamped.
         """
-        if not isinstance(self.model, Denoiser):
-            raise ValueError(f'layers need a model with head "kernel"; this one is {self.model.config}')
-        inputs, modulation = self._inputs(color, features)
+        if not self.filters_layers:
+            raise ValueError(f'this method needs a model with head "kernel"; this one is {self.model.config}')
+        inputs, modulation = self._inputs(color, self.with_filtered_albedo(features))
         albedo = torch.cat((modulation[0] ** self.gamma, torch.ones_like(modulation[0, :1])))
         albedo = albedo[[layer_color(name) for name in layers]]
         planes = torch.stack(list(layers.values())) / albedo
@@ -111,12 +116,20 @@ class Bundle:
         filtered = filtered.flatten(0, 1)[: len(planes)] * albedo
         return transfer.expand(out * modulation, self.meta["normalizer"]), dict(zip(layers, filtered))
 
-    def _inputs(self, color: Tensor, features: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        """The network's inputs for prepared colour and features, and the modulation of its output."""
+    def _radiance(self, color: Tensor, features: Tensor, demodulates: bool = True) -> Tensor:
+        """As `radiance`, for features with filtered albedo."""
+        inputs, modulation = self._inputs(color, features, demodulates)
+        return transfer.expand(self.model(*inputs) * modulation, self.meta["normalizer"])
+
+    def _inputs(
+        self, color: Tensor, features: Tensor, demodulates: bool = True
+    ) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """The network's inputs for prepared colour and filtered features, and the modulation of its output."""
         if isinstance(self.model, Kpcn):
             raise ValueError("kpcn takes diffuse and specular light: call `model` with them, or use demc-infer")
-        features = self.with_filtered_albedo(features)
         modulation = self.modulation(features)
+        if not demodulates:
+            modulation = torch.ones_like(modulation)
         compressed = transfer.compress(color, self.meta["normalizer"]) / modulation
         return (compressed, self.features_z_from_raw(features)), modulation
 
@@ -162,11 +175,8 @@ class Bundle:
         float32. Edge pixels are repeated up to a multiple of 32 and cropped afterwards. The network
         sees the colour times `input_scale`, by default that of `input_scale(color_hdr)`.
         """
-        color, feats, scale = preprocess.prepare(color_hdr, features, self.meta, input_scale)
-        out = self.radiance(*(self._padded(x)[None] for x in (color, feats)))
-        height, width = color.shape[-2:]
-        image = out[0, :, :height, :width].cpu().numpy() / scale
-        return image * light.factors(color_hdr, image, self.meta)
+        _, feats, scale = preprocess.prepare(color_hdr, features, self.meta, input_scale)
+        return self._denoised(color_hdr, self._prepared(feats), scale)
 
     @torch.inference_mode()
     def denoise_with_layers(
@@ -176,13 +186,16 @@ class Bundle:
         layers: Mapping[str, np.ndarray],
         input_scale: float | None = None,
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """As `denoise`, with further channels [H, W] by name, as `demc-infer denoise --layers` filters them.
+        """As `denoise`, with further channels [H, W] by name, as `demc-infer denoise --layers` denoises them.
 
-        They are filtered with the kernels of the colour: layers that add up to it still do. Returns
-        the colour and the layers. Raises ValueError for a model without a kernel head.
+        A kernel head filters them with the kernels of the colour. Other networks denoise each as an image
+        of its own (`layers`). Layers that add up to the colour still do. Returns the colour and the layers.
+        Raises ValueError for KPCN.
         """
         if not layers:
             return self.denoise(color_hdr, features, input_scale), {}
+        if isinstance(self.model, Kpcn):
+            raise ValueError("a kpcn model denoises no layers: it takes diffuse and specular light, not images")
         color, feats, scale = preprocess.prepare(color_hdr, features, self.meta, input_scale)
         height, width = color.shape[-2:]
         for name, plane in layers.items():
@@ -190,6 +203,10 @@ class Bundle:
                 raise ValueError(f"layer {name} is {list(plane.shape)}: expected [{height}, {width}]")
             if not np.isfinite(plane).all():
                 raise ValueError(f"layer {name} contains NaN or infinite values")
+        if not self.filters_layers:
+            feats = self._prepared(feats)
+            image = self._denoised(color_hdr, feats, scale)
+            return image, scaled(self._layer_images(feats, layers), layers, color_hdr, image)
         planes = self._padded(np.stack([np.float32(plane) for plane in layers.values()]))
         out, filtered = self.radiance_with_layers(
             self._padded(color)[None], self._padded(feats)[None], dict(zip(layers, planes))
@@ -202,6 +219,30 @@ class Bundle:
             for name, plane in filtered.items()
         }
         return image * factors, filtered
+
+    def _layer_images(self, features: Tensor, layers: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Each layer as the network denoises it as an image of its own; for features of `_prepared`."""
+        denoised = {}
+        for names in layer_images(layers):
+            noisy = np.stack([np.float32(layers[names[i % len(names)]]) for i in range(3)])
+            is_color = len(names) == 3
+            planes = self._denoised(noisy, features, np.float32(self.input_scale(noisy)), is_color)
+            denoised |= dict(zip(names, planes if is_color else planes.mean(0, keepdims=True)))
+        return {name: denoised[name] for name in layers}
+
+    def _denoised(
+        self, color_hdr: np.ndarray, features: Tensor, scale: np.float32, demodulates: bool = True
+    ) -> np.ndarray:
+        """An image [3, H, W] with its light, denoised with features of `_prepared`."""
+        height, width = color_hdr.shape[-2:]
+        color = self._padded(np.float32(color_hdr) * scale)[None]
+        out = self._radiance(color, features, demodulates)
+        image = out[0, :, :height, :width].cpu().numpy() / scale
+        return image * light.factors(color_hdr, image, self.meta)
+
+    def _prepared(self, features: np.ndarray) -> Tensor:
+        """Features of `preprocess.prepare` as a padded batch with filtered albedo."""
+        return self.with_filtered_albedo(self._padded(features)[None])
 
     def _padded(self, planes: np.ndarray) -> Tensor:
         """Colour, features, or layers [C, H, W] on the network's device, padded as the network needs."""

@@ -55,8 +55,7 @@ READINGS = {
 class ModelConfig:
     """The `model` part of a bundle's metadata.
 
-    `head` "kernel" predicts kernels (`kernel_head`), "mixed" blends their image with a U-Net's. "grey" and "xavier", and
-    `detail`, are initialisations.
+    `head` "kernel" predicts kernels (`kernel_head`). "grey" and "xavier", and `detail`, are initialisations.
     """
 
     variant: str = "demc"
@@ -72,7 +71,7 @@ class ModelConfig:
         for what, value, known in (
             ("variant", self.variant, (*VARIANTS, KPCN, *UNETS)),
             ("reading", self.reading, READINGS),
-            ("head", self.head, ("grey", "xavier", "kernel", "mixed")),
+            ("head", self.head, ("grey", "xavier", "kernel")),
             ("detail", self.detail, ("open", "xavier")),
             ("size", self.size, ("small", "base", "medium", "large")),
             ("guides", self.guides, ("none", "albedo", "albedo-normal")),

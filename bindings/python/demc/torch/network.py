@@ -27,7 +27,7 @@ BN_MOMENTUM = 0.01
 OPEN_BIAS = 1.0
 """Initial bias of the detail map's last convolution if `detail` is "open" (ours)."""
 GREY_HEAD_SCALE = 0.1
-"""Factor of the head's Xavier weights if `head` is "grey" or "kernel", and of a mixed head's new ones (ours)."""
+"""Factor of the head's Xavier weights if `head` is "grey" or "kernel" (ours)."""
 KERNEL_LEVELS = 4
 """Levels at which a kernel head filters, from the full resolution down."""
 KERNEL_TAPS = 25

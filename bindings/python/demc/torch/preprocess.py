@@ -10,12 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .config import UNETS
+
 FEATURES = 12
 """Normal xyz, world position xyz, albedo RGB (first hit), albedo RGB (second hit) (Sec. 3.1)."""
 SIZE_MULTIPLE = 32
 """Heights and widths must be multiples of this: five max-pools of 2."""
 UNET_MULTIPLE = 16
-"""The same for the variant `unet`: four max-pools of 2."""
+"""The same for U-Nets: four max-pools of 2."""
 GAMMA = 2.2
 """Exponent of the colour compression (Eq. 4)."""
 MAX_INPUT_SCALE = 1e6
@@ -60,11 +62,11 @@ def prepare(color_hdr: np.ndarray, features: np.ndarray, meta: dict, scale: floa
 def pad(image: np.ndarray, meta: dict | None = None) -> np.ndarray:
     """Colour or features [C, H, W], padded at the right and the bottom to the sizes that the network takes.
 
-    Edges are repeated up to multiples of 32. For the variant `unet` of `meta`, black and the features' means are
+    Edges are repeated up to multiples of 32. For a U-Net, `meta` says so, black and the features' means are
     appended up to multiples of 16.
     """
     height, width = image.shape[-2:]
-    if meta is None or meta["model"]["variant"] != "unet":
+    if meta is None or meta["model"]["variant"] not in UNETS:
         return np.pad(image, ((0, 0), (0, -height % SIZE_MULTIPLE), (0, -width % SIZE_MULTIPLE)), "edge")
     size = [length + -length % UNET_MULTIPLE for length in (height, width)]
     fill = meta["normalizer"]["features"]["mean"] if len(image) == FEATURES else [0.0] * len(image)
@@ -72,11 +74,6 @@ def pad(image: np.ndarray, meta: dict | None = None) -> np.ndarray:
     padded[:] = np.array(fill)[:, None, None]
     padded[:, :height, :width] = image
     return padded
-
-
-def layer_color(name: str) -> int:
-    """The colour channel whose albedo belongs to a layer: 0 for names that end in R, 1 in G, 2 in B, else 3."""
-    return {"r": 0, "g": 1, "b": 2}.get(name.rpartition(".")[2].lower(), 3)
 
 
 def input_scale(color_hdr: np.ndarray, meta: dict) -> float:

@@ -9,16 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from .config import UNETS, ModelConfig
-from .network import (
-    CHANNELS,
-    GREY_HEAD_SCALE,
-    KERNEL_LEVELS,
-    OPEN_BIAS,
-    Fusion,
-    filtered_on_all_scales,
-    kernel_convolutions,
-)
-from .transfer import compress_pu, expand_pu
+from .network import CHANNELS, OPEN_BIAS, Fusion
 
 SIZES = {
     "small": (((32, 32), (32,), (32,), (32,)), (32, 32), ((64, 64), (64, 64), (64, 32), (32, 32))),
@@ -31,8 +22,6 @@ GUIDES = {"none": (), "albedo": (6,), "albedo-normal": (6, 0)}
 """The first feature channel of each guide, in the order of the network's input."""
 SIDE_WIDTHS = (1, 2, 4, 4)
 """Channels of the second encoder's levels as multiples of the width, from the full resolution down."""
-GATE_BIAS = -2.0
-"""Initial bias of a mixed head's gate: 12 % of the filtered image."""
 HALVINGS = 4
 """Heights and widths must be multiples of 2 to this power."""
 
@@ -48,22 +37,6 @@ class Level(nn.Module):
         for conv in self.convs:
             x = F.relu(conv(x))
         return x
-
-
-class MixedHead(nn.Module):
-    """Blends the U-Net's image with the noisy colour, filtered with predicted kernels."""
-
-    def __init__(self, channels: Sequence[int]) -> None:
-        """`channels` of the decoder's levels, from the full resolution down."""
-        super().__init__()
-        self.kernels = kernel_convolutions(channels)
-        self.gate = nn.Conv2d(channels[0], 1, 1)
-
-    def forward(self, direct: Tensor, decoded: Sequence[Tensor], color: Tensor) -> Tensor:
-        """`direct` and `color` [B, 3, H, W], and the decoder's maps, the deepest first -> [B, 3, H, W]."""
-        logits = [conv(x) for conv, x in zip(self.kernels, decoded[-KERNEL_LEVELS:])]
-        filtered = compress_pu(filtered_on_all_scales(logits, expand_pu(color.detach())))
-        return torch.lerp(direct, filtered, self.gate(decoded[-1]).sigmoid())
 
 
 class SideEncoder(nn.Module):
@@ -113,7 +86,6 @@ class Unet(nn.Module):
         self.head = nn.Conv2d(channels, 3, 3, padding=1)
         decoded = [outputs[-1] for outputs in reversed(decoder)]
         source = UNETS[config.variant]
-        self.mixed = MixedHead(decoded) if config.head == "mixed" else None
         self.side = SideEncoder(source, config.width, decoded) if source else None
         self._initialise()
 
@@ -123,10 +95,6 @@ class Unet(nn.Module):
             if isinstance(conv, nn.Conv2d):
                 nn.init.xavier_uniform_(conv.weight)
                 nn.init.zeros_(conv.bias)
-        if self.mixed is not None:
-            for conv in (*self.mixed.kernels, self.mixed.gate):
-                conv.weight.mul_(GREY_HEAD_SCALE)
-            self.mixed.gate.bias.fill_(GATE_BIAS)
         if self.side is not None:
             for conv in self.side.fuses:
                 nn.init.zeros_(conv.weight)
@@ -138,7 +106,7 @@ class Unet(nn.Module):
         """Colour [B, 3, H, W] and features [B, 12, H, W], both in OIDN's value ranges -> [B, 3, H, W], not negative."""
         x = torch.cat((color, *(features[:, first : first + 3] for first in self.guides)), 1)
         side = None if self.side is None else self.side(features)
-        skips, decoded = [], []
+        skips = []
         for level in self.encoder:
             skips.append(x)
             x = F.max_pool2d(level(x), 2)
@@ -147,6 +115,4 @@ class Unet(nn.Module):
             x = level(torch.cat((F.interpolate(x, scale_factor=2, mode="nearest"), skips.pop()), 1))
             if side is not None:
                 x = F.relu(self.side.fuses[index](torch.cat((x, side.pop()), 1)))
-            decoded.append(x)
-        direct = F.relu(self.head(x))
-        return direct if self.mixed is None else self.mixed(direct, decoded, color)
+        return F.relu(self.head(x))
