@@ -43,10 +43,10 @@ impl<'a> LayerImages<'a> {
         1 + self.images.len()
     }
 
-    /// Denoises one image after the other, as `input` does the colour.
+    /// Denoises one image after the other, as `input` does the colour. A grey image of one value stays.
     ///
     /// # Shapes
-    /// Returns planar `[layers, H, W]`, not negative.
+    /// Returns planar `[layers, H, W]`.
     pub(super) fn denoise(
         &self,
         input: &FrameInput,
@@ -59,6 +59,14 @@ impl<'a> LayerImages<'a> {
         let pixels = height * width;
         let mut denoised = vec![0.0; self.layers.len() * pixels];
         for (index, image) in self.images.iter().enumerate() {
+            if let LayerImage::Grey(layer) = *image {
+                let samples = &self.layers[layer].samples;
+                // The network would change alpha without edges a little.
+                if samples.iter().all(|sample| *sample == samples[0]) {
+                    denoised[layer * pixels..][..pixels].copy_from_slice(samples);
+                    continue;
+                }
+            }
             let indices = match *image {
                 LayerImage::Color(indices) => indices,
                 LayerImage::Grey(index) => [index; COLOR_CHANNELS],

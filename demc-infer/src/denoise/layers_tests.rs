@@ -144,6 +144,24 @@ fn layers_of_a_network_without_kernels_are_images_of_their_own() {
 }
 
 #[test]
+fn a_grey_layer_of_one_value_stays() {
+    let (frame, _) = passes(50, 70);
+    let alpha = Layer {
+        name: "Combined.A".into(),
+        samples: vec![0.7; 50 * 70],
+    };
+    for model in [plain_model(), unet()] {
+        let found = run(
+            &model,
+            &frame,
+            std::slice::from_ref(&alpha),
+            Tiling::default(),
+        );
+        assert_eq!(found.layers, alpha.samples);
+    }
+}
+
+#[test]
 fn the_share_grows_once_over_the_passes_of_all_layers() {
     let mut bundle = plain_model();
     bundle.albedo_filter = None;

@@ -226,6 +226,9 @@ class Bundle:
         for names in layer_images(layers):
             noisy = np.stack([np.float32(layers[names[i % len(names)]]) for i in range(3)])
             is_color = len(names) == 3
+            if not is_color and noisy.min() == noisy.max():
+                denoised[names[0]] = noisy[0]
+                continue
             planes = self._denoised(noisy, features, np.float32(self.input_scale(noisy)), is_color)
             denoised |= dict(zip(names, planes if is_color else planes.mean(0, keepdims=True)))
         return {name: denoised[name] for name in layers}
