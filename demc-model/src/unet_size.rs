@@ -23,7 +23,7 @@ pub enum UnetSize {
     /// 0.9 million parameters, OIDN's quality `high` with noisy guides.
     #[default]
     Base,
-    /// 3.6 million parameters: the large one with fewer channels at the two finest levels.
+    /// 3.8 million parameters: the large one with fewer channels at the full resolution.
     Medium,
     /// 3.8 million parameters, OIDN's quality `high` with clean guides.
     Large,
@@ -85,9 +85,9 @@ impl UnetSize {
             },
             UnetSize::Medium => &UnetSpec {
                 name: "medium",
-                encoder: [&[48, 48], &[80, 80], &[128, 128], &[192, 192]],
+                encoder: [&[48, 64], &[96, 96], &[128, 128], &[192, 192]],
                 bottom: [256, 256],
-                decoder: [[192, 192], [128, 128], [80, 80], [48, 48]],
+                decoder: [[192, 192], [128, 128], [96, 96], [48, 48]],
             },
             UnetSize::Large => &UnetSpec {
                 name: "large",
